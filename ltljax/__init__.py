@@ -1,0 +1,43 @@
+"""Differentiable partial differential equations on triangle meshes, in JAX, by local tangential lifting.
+
+The data's way: a mesh file becomes a `Mesh`, a mesh and a scheme a `Surface`; operators act on fields over a surface;
+equations are made of operators; `solve` carries them through time.
+
+    mesh = ltl.load_mesh("spot.obj")
+    surface = ltl.Surface.from_mesh(mesh)
+    solution = ltl.solve(ltl.Diffusion(), surface, u0, t1=1.0)
+"""
+
+from importlib.metadata import version as _version
+
+from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
+from .lifting.schemes import Monotone, Paper
+from .mesh import Mesh, MeshError, load_mesh, shapes
+from .operators import divergence, gradient, integrate, laplacian, laplacian_matrix
+from .solve import RKC2, Solution, SolveError, solve
+from .surface import Surface
+
+__version__ = _version("ltljax")
+
+__all__ = [
+    "RKC2",
+    "Diffusion",
+    "Equation",
+    "Mesh",
+    "MeshError",
+    "Monotone",
+    "Paper",
+    "ReactionDiffusion",
+    "Solution",
+    "SolveError",
+    "Surface",
+    "divergence",
+    "gradient",
+    "integrate",
+    "kinetics",
+    "laplacian",
+    "laplacian_matrix",
+    "load_mesh",
+    "shapes",
+    "solve",
+]

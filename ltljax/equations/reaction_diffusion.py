@@ -1,0 +1,55 @@
+"""Several species that diffuse and react."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..operators import laplacian, spectral_bound
+from ..surface import Surface
+from .equation import Equation
+from .kinetics import Kinetics
+
+
+class ReactionDiffusion(Equation):
+    """u_t = D_a Delta u + f(u, v), v_t = D_b Delta v + g(u, v), for any number of species.
+
+    The state is one array (V, S). On a boundary the normal derivatives vanish.
+
+    Attributes:
+        diffusivity: (S,) one non-negative number for each species.
+        reaction: a `Kinetics`, or a plain function ``((u, v), params) -> (du, dv)`` of the species at one point.
+        params: the parameters of a plain function; a pytree of scalars, or of fields (V,) over the surface.
+
+    Source: Chen, Chi and Wu, arXiv 0907.1817, section 4; Turing (1952), doi:10.1098/rstb.1952.0012.
+    """
+
+    diffusivity: Float[Array, " S"]
+    reaction: Kinetics
+
+    def __init__(self, diffusivity: Any, reaction: Kinetics | Callable, params: Any = None):
+        self.diffusivity = jnp.stack([jnp.asarray(d, jnp.result_type(float)) for d in diffusivity])
+        self.reaction = reaction if isinstance(reaction, Kinetics) else Kinetics(reaction, params)
+
+    def rate(self, t, surface: Surface, u):
+        """The time derivative: diffusion of every species and the reaction at every vertex."""
+        self._check(u)
+        return self.diffusivity.astype(u.dtype) * laplacian(surface, u) + self.reaction(u)
+
+    def spectral_bound(self, t, surface: Surface, u):
+        """The diffusion's bound plus the largest row sum of the reaction's Jacobian over the surface."""
+        self._check(u)
+        species = jnp.eye(u.shape[1], dtype=u.dtype)
+        columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit, u.shape),))[1] for unit in species]
+        reaction = jnp.max(sum(jnp.abs(column) for column in columns))
+        return jnp.max(self.diffusivity.astype(u.dtype)) * spectral_bound(surface) + reaction
+
+    def _check(self, u: Array) -> None:
+        if u.ndim != 2 or u.shape[1] != self.diffusivity.shape[0]:
+            raise ValueError(
+                f"Expected a state of shape (V, {self.diffusivity.shape[0]}), one column for each diffusivity, "
+                f"found {u.shape}."
+            )

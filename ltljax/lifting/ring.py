@@ -1,0 +1,87 @@
+"""The one-ring of a vertex: its faces, its normal, and the ring laid into the tangent plane.
+
+Rings are slot-major: ``offsets[k, v]`` is neighbour k of vertex v, seen from v, in counter-clockwise order; an empty
+slot holds zero. Face k lies between slots k and k + 1; the ring of an interior vertex closes, that of a boundary vertex
+does not.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+from jaxtyping import Bool, Float, Int
+
+from ..tables import AnyArray
+from .frames import unit
+
+Lift = Literal["projection", "chord"]
+
+# A face is dropped when its area or the distance of its centroid is this small against its edges.
+DEGENERATE = 1e-12
+
+
+class RingTopology(eqx.Module):
+    """Which slots of a block of rings hold neighbours, and which consecutive pairs of them hold faces."""
+
+    valences: Int[AnyArray, " N"]
+    is_boundary: Bool[AnyArray, " N"]
+
+    def following(self, num_slots: int) -> Int[AnyArray, "K N"]:
+        """The slot after each slot; the slot itself where no face follows, so that such a face has no area."""
+        xp = self.valences.__array_namespace__()
+        slot = xp.arange(num_slots, dtype=self.valences.dtype)[:, None]
+        wrapped = xp.where(self.is_boundary, slot, 0)
+        return xp.where(slot + 1 < self.valences, slot + 1, xp.where(slot < self.valences, wrapped, slot))
+
+    def preceding(self, num_slots: int) -> Int[AnyArray, "K N"]:
+        """The slot before each slot, around the ring; empty slots keep to themselves."""
+        xp = self.valences.__array_namespace__()
+        slot = xp.arange(num_slots, dtype=self.valences.dtype)[:, None]
+        return xp.where(slot < self.valences, xp.where(slot > 0, slot - 1, self.valences - 1), slot)
+
+
+def take_slots(values: Float[AnyArray, "K N *C"], slots: Int[AnyArray, "K N"]) -> Float[AnyArray, "K N *C"]:
+    """Each row's values in the order of ``slots``."""
+    index = slots.reshape(*slots.shape, *(1,) * (values.ndim - 2))
+    return values.__array_namespace__().take_along_axis(values, index, axis=0)
+
+
+def last_slot(values: Float[AnyArray, "K N C"], topology: RingTopology) -> Float[AnyArray, "N C"]:
+    """Each row's value in its last used slot."""
+    return take_slots(values, (topology.valences - (topology.valences > 0))[None])[0]
+
+
+def centroid_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) -> Float[AnyArray, "N 3"]:
+    """Unit normals: face normals averaged with weights |G - v|^-2, G the centroid of the face.
+
+    First order in the mesh size on irregular meshes (second where rings are symmetric). A face without area has no
+    part in the mean.
+
+    Source: Chen, Chi and Wu, arXiv 0907.1817, section 2 (centroid weights).
+    """
+    xp = offsets.__array_namespace__()
+    following = take_slots(offsets, topology.following(offsets.shape[0]))
+    face_normals = xp.cross(offsets, following)
+    squared_area = xp.sum(face_normals**2, axis=-1)
+    squared_edges = xp.sum(offsets**2, axis=-1) * xp.sum(following**2, axis=-1)
+    squared_distance = xp.sum((offsets + following) ** 2, axis=-1) / 9
+    has_face = squared_area > DEGENERATE**2 * squared_edges
+    weight = 1 / xp.where(has_face, xp.sqrt(xp.where(has_face, squared_area, 1)) * squared_distance, 1)
+    return unit(xp.sum(xp.where(has_face, weight, 0)[..., None] * face_normals, axis=0))
+
+
+def lifted_ring(offsets: Float[AnyArray, "K N 3"], frames: Float[AnyArray, "N 2 3"], lift: Lift) -> Float[AnyArray, "K N 2"]:
+    """The ring in the tangent plane, in the coordinates of the frame.
+
+    ``"projection"`` drops the normal part (the paper's lift; lengths shrink). ``"chord"`` keeps the projected direction
+    and the length |v_i - v|, which is closer to the distance along the surface.
+    """
+    xp = offsets.__array_namespace__()
+    projected = xp.einsum("knc,nac->kna", offsets, frames)
+    if lift == "projection":
+        return projected
+    squared = xp.sum(projected**2, axis=-1, keepdims=True)
+    chord = xp.sum(offsets**2, axis=-1, keepdims=True)
+    # A neighbour straight above the vertex has no direction: it stays at the origin, where it gets no weight.
+    has_direction = squared > DEGENERATE**2 * chord
+    ratio = xp.sqrt(xp.where(has_direction, chord, 1) / xp.where(has_direction, squared, 1))
+    return xp.where(has_direction, projected * ratio, 0)

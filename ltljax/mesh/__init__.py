@@ -1,0 +1,14 @@
+"""Meshes: a file or arrays become a checked surface.
+
+What enters: a mesh file, arrays, or the sizes of a built-in shape. What leaves: a `Mesh`, its report, and the index
+arrays of its topology. Every error that a mesh can cause is raised here. NumPy and SciPy only; nothing runs on a device.
+"""
+
+from . import shapes
+from .errors import MeshError
+from .files import load_mesh
+from .mesh import Mesh
+from .report import MeshReport
+from .topology import OneRings, k_ring, one_rings
+
+__all__ = ["Mesh", "MeshError", "MeshReport", "OneRings", "k_ring", "load_mesh", "one_rings", "shapes"]

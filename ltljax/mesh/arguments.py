@@ -1,0 +1,39 @@
+"""Are the sizes and counts of a shape usable? Numbers enter; numbers or a sentence leave."""
+
+import operator
+from typing import Any
+
+
+def at_least(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """The value as an integer between the bounds."""
+    try:
+        count = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be an integer, found {value!r}.") from None
+    if count < least or (most is not None and count > most):
+        limit = f"at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be {limit}, found {count}.")
+    return count
+
+
+def positive(name: str, value: Any) -> float:
+    """The value as a positive, finite number."""
+    number = _number(name, value)
+    if not 0 < number < float("inf"):
+        raise ValueError(f"{name} must be positive and finite, found {number}.")
+    return number
+
+
+def not_negative(name: str, value: Any) -> float:
+    """The value as a finite number that is not negative."""
+    number = _number(name, value)
+    if not 0 <= number < float("inf"):
+        raise ValueError(f"{name} must be finite and not negative, found {number}.")
+    return number
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be a number, found {value!r}.") from None

@@ -1,0 +1,405 @@
+"""Is this a surface, and if not, can it become one? Checks, welding, orientation and repair.
+
+What enters: arrays as a user or a file gives them. What leaves: arrays of a manifold, consistently oriented triangle
+mesh with finite geometry, and a record of everything that was done; or a `MeshError`.
+
+The steps work in the numbering of the arrays handed in, so that messages name indices their reader knows. Vertices are
+renumbered once, at the end.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from .errors import MeshError
+from .report import face_areas
+from .topology import half_edges, undirected_keys
+
+# Weights go with the fourth power of lengths; within this range they, and products of two, stay finite in float64.
+LARGEST_LENGTH, SMALLEST_LENGTH = 1e60, 1e-60
+# A face this thin, area against the square of its longest edge, has no normal that rounding has not made up.
+THINNEST_FACE = 1e-14
+# Second derivatives take five neighbours, so every connected piece needs five vertices beside the one in question.
+FEWEST_VERTICES = 6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Checked:
+    """A mesh that passed, and what was done to it.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3) int32.
+        original_index: (V,) for each vertex, the first vertex handed in that it came from.
+        welded_index: (V_original,) for each vertex handed in, the vertex it became, or -1.
+        faces_in_file: number of faces handed in.
+        welded_vertices: vertices merged into another.
+        reoriented_faces: faces turned over.
+        repairs: what was mended, one sentence each.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    original_index: np.ndarray
+    welded_index: np.ndarray
+    faces_in_file: int
+    welded_vertices: int
+    reoriented_faces: int
+    repairs: tuple[str, ...]
+
+
+def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
+    """The checked mesh of arbitrary arrays.
+
+    Args:
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        repair: mend what can be mended, instead of raising.
+        weld: merge vertices at exactly the same position.
+
+    Raises:
+        MeshError: with the first thing found wrong.
+    """
+    vertices, faces = _as_arrays(vertices, faces)
+    work = _Workpiece(vertices, faces, repair)
+    work.check_indices()
+    work.check_positions()
+    representative = work.merge_vertices(weld)
+    work.check_degenerate()
+    work.check_duplicates()
+    work.check_edges()
+    work.check_fans()
+    work.check_components()
+    reoriented = work.orient()
+    if repair and work.repairs:
+        # What was mended has to pass like anything else. It does unless a repair above is wrong.
+        again = _Workpiece(work.vertices, work.faces, repair=False)
+        again.check_degenerate()
+        again.check_duplicates()
+        again.check_edges()
+        again.check_fans()
+        again.check_components()
+    used, compact = np.unique(work.faces, return_inverse=True)
+    new_index = np.full(len(work.vertices), -1, dtype=np.int64)
+    new_index[used] = np.arange(len(used))
+    welded_index = np.where(representative >= 0, new_index[representative], -1)
+    return Checked(
+        vertices=work.vertices[used],
+        faces=compact.reshape(work.faces.shape).astype(np.int32),
+        original_index=work.origin[used],
+        welded_index=welded_index,
+        faces_in_file=len(faces),
+        welded_vertices=int(np.sum((representative >= 0) & (representative != np.arange(len(representative))))),
+        reoriented_faces=reoriented,
+        repairs=tuple(work.repairs),
+    )
+
+
+def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The arguments as float64 (V, 3) and int64 (F, 3)."""
+    try:
+        vertices, faces = np.asarray(vertices), np.asarray(faces)
+    except Exception as error:  # np.asarray runs code of the objects it is given, which may raise anything
+        raise MeshError(f"Vertices and faces must be arrays of numbers, (V, 3) and (F, 3), but: {error}") from error
+    if vertices.dtype.kind not in "fiu":
+        raise MeshError(f"Vertices must be real numbers, found {vertices.dtype}. Convert them to float64.")
+    if faces.size == 0:
+        raise MeshError(
+            f"The mesh has no faces (and {len(vertices) if vertices.ndim else 0} vertices). A surface is made of "
+            "triangles: hand in faces (F, 3), or triangulate the points first."
+        )
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(
+            f"Vertices must have the shape (V, 3), found {vertices.shape}. A plane mesh needs a third coordinate of zeros."
+        )
+    if faces.dtype.kind not in "iu":
+        raise MeshError(f"Faces must be integers, found {faces.dtype}. Convert them with faces.astype(int).")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"Faces must have the shape (F, 3), found {faces.shape}. Split larger faces into triangles.")
+    if faces.dtype.kind == "u":
+        faces = np.minimum(faces, np.iinfo(np.int64).max)  # an index this large is reported below, not wrapped around
+    with np.errstate(over="ignore", invalid="ignore"):  # long double may not fit; that is reported as infinite
+        return vertices.astype(np.float64), faces.astype(np.int64)
+
+
+class _Workpiece:
+    """The mesh under inspection: arrays that the checks replace, and the list of repairs."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, repair: bool):
+        self.vertices = vertices
+        self.faces = faces
+        self.repair = repair
+        self.repairs: list[str] = []
+        self.origin = np.arange(len(vertices))
+
+    def _drop(self, is_bad: np.ndarray, message: Callable[[int], str], what: str) -> None:
+        """Drops the bad faces where repair is wanted, and raises the message for the first one where it is not."""
+        count = int(is_bad.sum())
+        if not count:
+            return
+        if not self.repair:
+            raise MeshError(message(int(np.flatnonzero(is_bad)[0])))
+        self.faces = self.faces[~is_bad]
+        self.repairs.append(f"dropped {count} {'face' if count == 1 else 'faces'} {what}")
+        if not len(self.faces):
+            raise MeshError(f"Repair left no faces: {'; '.join(self.repairs)}. The source holds no usable surface.")
+
+    def check_indices(self) -> None:
+        """Every face refers to vertices that exist."""
+        num_vertices = len(self.vertices)
+
+        def message(face: int) -> str:
+            corners = self.faces[face]
+            index = corners[(corners < 0) | (corners >= num_vertices)][0]
+            return (
+                f"Face {face} refers to vertex {index}, but there are {num_vertices} vertices, counted from 0. "
+                "Correct the index (formats that count from 1 need 1 subtracted), or use repair=True to drop such faces."
+            )
+
+        is_bad = np.any((self.faces < 0) | (self.faces >= num_vertices), axis=1)
+        self._drop(is_bad, message, "that referred to missing vertices")
+
+    def check_positions(self) -> None:
+        """The positions in use are finite, and of a size whose powers are finite too."""
+        is_finite = np.isfinite(self.vertices).all(axis=1)
+
+        def not_finite(face: int) -> str:
+            # The first vertex is named, not the first face, since that is what must be corrected.
+            vertex = int(np.unique(self.faces[~is_finite[self.faces]])[0])
+            position = ", ".join(f"{x:g}" for x in self.vertices[vertex])
+            return (
+                f"Vertex {vertex} has the position ({position}), which is not finite. "
+                "Correct it, or use repair=True to drop the faces around it."
+            )
+
+        self._drop(~is_finite[self.faces].all(axis=1), not_finite, "with a position that is not finite")
+        with np.errstate(invalid="ignore"):
+            is_moderate = (np.abs(self.vertices) <= LARGEST_LENGTH).all(axis=1)
+
+        def too_large(face: int) -> str:
+            vertex = int(np.unique(self.faces[~is_moderate[self.faces]])[0])
+            value = float(np.abs(self.vertices[vertex]).max())
+            return (
+                f"Vertex {vertex} has a coordinate of size {value:g}; beyond {LARGEST_LENGTH:g} areas and weights "
+                "overflow. Scale the mesh, or use repair=True to drop the faces around it."
+            )
+
+        self._drop(~is_moderate[self.faces].all(axis=1), too_large, "with a position too large to compute with")
+        # Minus zero and zero are one position.
+        self.vertices = self.vertices + 0.0
+
+    def merge_vertices(self, weld: bool) -> np.ndarray:
+        """Lets faces refer to the first of the vertices at each position; returns that vertex, or -1 if unused, (V,)."""
+        used = np.unique(self.faces)
+        representative = np.full(len(self.vertices), -1, dtype=np.int64)
+        representative[used] = used
+        if weld:
+            positions = self.vertices[used]
+            order = np.lexsort(positions.T)  # stable, so the first of equals comes first
+            is_new = np.ones(len(order), bool)
+            is_new[1:] = np.any(positions[order[1:]] != positions[order[:-1]], axis=1)
+            representative[used[order]] = used[order[is_new]][np.cumsum(is_new) - 1]
+            self.faces = representative[self.faces]
+        return representative
+
+    def check_degenerate(self) -> None:
+        """Every face has three different vertices and an area."""
+        first, second, third = self.faces.T
+        repeats = (first == second) | (second == third) | (third == first)
+
+        def repeated(face: int) -> str:
+            return (
+                f"Face {face} names a vertex twice: {tuple(self.faces[face].tolist())}. A triangle has three different "
+                "corners. Remove it, or use repair=True to drop such faces."
+            )
+
+        self._drop(repeats, repeated, "with fewer than three different corners")
+        longest = self._edge_lengths().max(axis=1)
+
+        def too_small(face: int) -> str:
+            return (
+                f"Face {face} has a longest edge of {longest[face]:g}; below {SMALLEST_LENGTH:g} areas and weights "
+                "underflow. Scale the mesh, or use repair=True to drop such faces."
+            )
+
+        # A face with three corners at one place is thin rather than small.
+        is_small = (longest < SMALLEST_LENGTH) & (longest > 0)
+        self._drop(is_small, too_small, "too small to compute with")
+        longest = self._edge_lengths().max(axis=1)
+        areas = face_areas(self.vertices, self.faces)
+
+        def no_area(face: int) -> str:
+            return (
+                f"Face {face} {tuple(self.faces[face].tolist())} has no area: {areas[face]:.3g} with a longest edge of "
+                f"{longest[face]:.3g}. Remove it or remesh, or use repair=True to drop such faces."
+            )
+
+        self._drop(~(areas > THINNEST_FACE * longest**2), no_area, "without area")
+
+    def _edge_lengths(self) -> np.ndarray:
+        corners = self.vertices[self.faces]
+        return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+
+    def check_duplicates(self) -> None:
+        """No two faces have the same three vertices."""
+        corners = np.sort(self.faces, axis=1)
+        order = np.lexsort(corners.T)  # stable, so of equal faces the first comes first
+        repeats = np.zeros(len(order), bool)
+        repeats[order[1:]] = np.all(corners[order[1:]] == corners[order[:-1]], axis=1)
+
+        def message(face: int) -> str:
+            twin = int(np.flatnonzero(np.all(corners == corners[face], axis=1))[0])
+            return (
+                f"Faces {twin} and {face} have the same corners {tuple(corners[face].tolist())}. "
+                "A surface has one face there. Remove the other, or use repair=True to drop duplicates."
+            )
+
+        self._drop(repeats, message, "that duplicated another")
+
+    def check_edges(self) -> None:
+        """No edge belongs to more than two faces."""
+        keys = undirected_keys(half_edges(self.faces), len(self.vertices))
+        face = np.tile(np.arange(len(self.faces)), 3)
+        # Sorted by edge, and within an edge from the largest face to the smallest: the rank within the edge.
+        order = np.lexsort((face, -face_areas(self.vertices, self.faces)[face], keys))
+        begins = np.ones(len(order), bool)
+        begins[1:] = keys[order[1:]] != keys[order[:-1]]
+        starts = np.flatnonzero(begins)
+        rank = np.arange(len(order)) - starts[np.cumsum(begins) - 1]
+        is_bad = np.zeros(len(self.faces), bool)
+        is_bad[face[order[rank > 1]]] = True
+
+        def message(_: int) -> str:
+            key = int(keys[order[rank > 1]].min())
+            edge = divmod(key, len(self.vertices))
+            return (
+                f"Edge {edge} belongs to {int(np.sum(keys == key))} faces, so the surface is not a manifold there. "
+                "Separate the sheets, or load with repair=True to drop the extra faces."
+            )
+
+        self._drop(is_bad, message, "at edges that had more than two (the two largest stay)")
+
+    def _shared_edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The pairs of half-edges that share an edge, (N,) each, and whether both run the same way."""
+        directed = half_edges(self.faces)
+        keys = undirected_keys(directed, len(self.vertices))
+        order = np.argsort(keys, kind="stable")
+        pairs = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+        one, other = order[pairs], order[pairs + 1]
+        return one, other, directed[one, 0] == directed[other, 0]
+
+    def check_fans(self) -> None:
+        """The faces at each vertex form one fan; splitting gives every further fan a vertex of its own."""
+        num_faces = len(self.faces)
+        one, other, same_way = self._shared_edges()
+        # Corner j of face f is 3 f + j. A half-edge of block j runs from corner j to corner j + 1 of its face.
+        begin, end = 3 * (one % num_faces) + one // num_faces, 3 * (one % num_faces) + (one // num_faces + 1) % 3
+        first = 3 * (other % num_faces) + other // num_faces
+        last = 3 * (other % num_faces) + (other // num_faces + 1) % 3
+        links = np.concatenate([begin, end]), np.concatenate([np.where(same_way, first, last), np.where(same_way, last, first)])
+        fans = _components(links, 3 * num_faces)
+        corners = self.faces.ravel()
+        order = np.lexsort((fans, corners))
+        begins = np.ones(len(order), bool)
+        begins[1:] = (corners[order[1:]] != corners[order[:-1]]) | (fans[order[1:]] != fans[order[:-1]])
+        fan_vertices = corners[order[begins]]
+        is_further = np.zeros(len(fan_vertices), bool)
+        is_further[1:] = fan_vertices[1:] == fan_vertices[:-1]
+        if not is_further.any():
+            return
+        split = np.unique(fan_vertices[is_further])
+        if not self.repair:
+            count = int(np.sum(fan_vertices == split[0]))
+            raise MeshError(
+                f"The faces at vertex {split[0]} form {count} fans that touch only there, so the surface is not a manifold "
+                "at it. Give each fan a vertex of its own, or use repair=True to split it."
+            )
+        names = fan_vertices.copy()
+        names[is_further] = len(self.vertices) + np.arange(is_further.sum())
+        renamed = np.empty_like(corners)
+        renamed[order] = names[np.cumsum(begins) - 1]
+        self.faces = renamed.reshape(-1, 3)
+        self.vertices = np.concatenate([self.vertices, self.vertices[fan_vertices[is_further]]])
+        self.origin = np.concatenate([self.origin, self.origin[fan_vertices[is_further]]])
+        noun = "vertex" if len(split) == 1 else "vertices"
+        self.repairs.append(f"split {len(split)} {noun} where separate fans touched")
+
+    def check_components(self) -> None:
+        """Every connected component has enough vertices."""
+        edges = half_edges(self.faces)
+        labels = _components((edges[:, 0], edges[:, 1]), len(self.vertices))
+        used = np.unique(self.faces)
+        sizes = np.bincount(labels[used], minlength=labels.max() + 1)
+        face_sizes = sizes[labels[self.faces[:, 0]]]
+
+        def message(face: int) -> str:
+            return (
+                f"The connected component of vertex {self.faces[face].min()} has {face_sizes[face]} vertices; at least "
+                f"{FEWEST_VERTICES} are needed, since second derivatives at a vertex take five neighbours. "
+                "Subdivide it, or use repair=True to drop such components."
+            )
+
+        self._drop(face_sizes < FEWEST_VERTICES, message, "of components too small to differentiate on")
+
+    def orient(self) -> int:
+        """Turns faces over until all agree with their neighbours and closed components face out; returns how many."""
+        num_faces = len(self.faces)
+        one, other, same_way = self._shared_edges()
+        f, g = one % num_faces, other % num_faces
+        # The orientation double cover: every face twice, once as given and once turned over. Neighbours that agree are
+        # linked as they are, others crosswise. A component is orientable when its two copies stay apart.
+        crossed = np.where(same_way, num_faces, 0)
+        links = np.concatenate([f, f + num_faces]), np.concatenate([g + crossed, g + num_faces - crossed])
+        labels = _components(links, 2 * num_faces)
+        given, turned = labels[:num_faces], labels[num_faces:]
+        if np.any(given == turned):
+            raise MeshError(self._non_orientable(f, g, same_way, given == turned))
+        _, component = np.unique(np.minimum(given, turned), return_inverse=True)
+        is_turned = given > turned
+        minority = np.bincount(component, is_turned) * 2 > np.bincount(component)
+        is_turned ^= minority[component]
+        is_closed = np.bincount(component, minlength=len(minority)) * 3 == 2 * np.bincount(component[f], minlength=len(minority))
+        is_turned ^= (is_closed & (self._volumes(component, is_turned) < 0))[component]
+        self.faces = np.where(is_turned[:, None], self.faces[:, [0, 2, 1]], self.faces)
+        return int(is_turned.sum())
+
+    def _volumes(self, component: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
+        """Six times the signed volume of each component with some of its faces turned over."""
+        corners = self.vertices[self.faces]
+        counts = np.bincount(component)
+        # About the component's own middle, or a far away origin would cancel the digits.
+        middle = np.stack([np.bincount(component, x) for x in corners.mean(axis=1).T], axis=1) / counts[:, None]
+        first, second, third = np.moveaxis(corners - middle[component, None], 1, 0)
+        volumes = np.sum(first * np.cross(second, third), axis=1)
+        return np.bincount(component, np.where(is_turned, -volumes, volumes))
+
+    def _non_orientable(self, f: np.ndarray, g: np.ndarray, same_way: np.ndarray, is_bad: np.ndarray) -> str:
+        """The message, with an edge across which no choice of orientations agrees once the others do."""
+        num_faces = len(self.faces)
+        # Agreement along a spanning tree fixes all orientations; the edges left over then tell.
+        weights = sparse.coo_array((np.arange(1, len(f) + 1), (f, g)), shape=(num_faces, num_faces))
+        tree = csgraph.minimum_spanning_tree(weights.tocsr()).tocoo()
+        edge = tree.data.astype(np.int64) - 1
+        crossed = np.where(same_way[edge], num_faces, 0)
+        links = np.concatenate([f[edge], f[edge] + num_faces]), np.concatenate(
+            [g[edge] + crossed, g[edge] + num_faces - crossed]
+        )
+        labels = _components(links, 2 * num_faces)
+        is_turned = labels[:num_faces] > labels[num_faces:]
+        fails = is_bad[f] & (same_way ^ is_turned[f] ^ is_turned[g])
+        where = int(np.flatnonzero(fails)[0])
+        shared = np.intersect1d(self.faces[f[where]], self.faces[g[where]])
+        return (
+            f"The surface is not orientable: once all other faces agree, those at edge {tuple(shared.tolist()[:2])} "
+            "do not (a Moebius strip or a Klein bottle). Cut it along a curve through that edge; repair cannot do this."
+        )
+
+
+def _components(links: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
+    """The component label of each of ``count`` nodes under the links."""
+    graph = sparse.coo_array((np.ones(len(links[0]), np.int8), links), shape=(count, count))
+    return csgraph.connected_components(graph.tocsr(), directed=False)[1]

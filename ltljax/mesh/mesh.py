@@ -1,0 +1,226 @@
+"""`Mesh`: a triangle mesh that has passed every check.
+
+What enters: vertices and faces, by hand, from a shape or from a file. What leaves: an immutable record whose faces are a
+manifold, consistently oriented surface, so that no later room needs to ask.
+"""
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from . import topology
+from .checks import LARGEST_LENGTH, Checked, check
+from .errors import MeshError
+from .report import MeshReport, corner_angles, face_areas
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
+class Mesh:
+    """A checked triangle mesh: manifold, consistently oriented (outwards where closed), with finite geometry.
+
+    Faces that disagree with their neighbours are turned over, and vertices that no face refers to are dropped; the
+    report says so. All arrays are read-only.
+
+    Attributes:
+        vertices: (V, 3) float64, positions.
+        faces: (F, 3) int32, vertex indices, counter-clockwise seen from outside.
+        original_index: (V,) int64, for each vertex the (first) vertex it came from in the file or array handed in.
+        welded_index: (V_original,) int64, for each vertex handed in the one it became, or -1 if it was dropped.
+        normals: (V, 3) float64, exact unit outward normals where the shape is known by formula, else None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    original_index: np.ndarray
+    welded_index: np.ndarray
+    normals: np.ndarray | None
+    _checked: Checked
+
+    def __init__(
+        self, vertices: Any, faces: Any, *, repair: bool = False, weld: bool = False, normals: Any | None = None
+    ):
+        """Checks the arrays.
+
+        Args:
+            vertices: (V, 3) positions.
+            faces: (F, 3) vertex indices, counted from 0.
+            repair: mend what can be mended, instead of raising: drop degenerate, duplicate and broken faces, the extra
+                faces at an edge of three, and components that are too small; split vertices where fans touch. The
+                report lists each action.
+            weld: merge vertices at exactly the same position.
+            normals: (V, 3) exact unit outward normals, if the surface is known by formula.
+
+        Raises:
+            MeshError: if the arrays are not a surface; the message names the first offending index.
+        """
+        checked = check(vertices, faces, repair=repair, weld=weld)
+        if normals is not None:
+            normals = np.array(normals, dtype=np.float64)
+            expected = (len(checked.welded_index), 3)
+            if normals.shape != expected:
+                raise MeshError(f"Normals must have the shape of the vertices, {expected}, found {normals.shape}.")
+            normals = normals[checked.original_index]
+            is_bad = ~(np.abs(np.linalg.norm(normals, axis=1) - 1) < 1e-6)
+            if is_bad.any():
+                first = int(checked.original_index[np.flatnonzero(is_bad)[0]])
+                raise MeshError(f"Normals must have length 1, but the one at vertex {first} has not. Normalise them.")
+        self._fill(checked, normals)
+
+    def _fill(self, checked: Checked, normals: np.ndarray | None) -> None:
+        """Sets the fields, once, and makes their arrays read-only."""
+        fields = {
+            "vertices": checked.vertices,
+            "faces": checked.faces,
+            "original_index": checked.original_index,
+            "welded_index": checked.welded_index,
+            "normals": normals,
+            "_checked": checked,
+        }
+        for name, value in fields.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @property
+    def num_vertices(self) -> int:
+        """The number of vertices."""
+        return len(self.vertices)
+
+    @property
+    def num_faces(self) -> int:
+        """The number of faces."""
+        return len(self.faces)
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """The edges (E, 2), int32, lower vertex first, sorted."""
+        return _frozen(topology.unique_edges(self.faces))
+
+    @cached_property
+    def boundary_loops(self) -> list[np.ndarray]:
+        """The boundary curves, each an int32 array of vertices with the surface on the left."""
+        return [_frozen(loop) for loop in topology.boundary_loops(self.faces, self.num_vertices)]
+
+    @cached_property
+    def boundary_vertices(self) -> np.ndarray:
+        """Whether each vertex lies on the boundary, (V,) bool."""
+        is_boundary = np.zeros(self.num_vertices, bool)
+        for loop in self.boundary_loops:
+            is_boundary[loop] = True
+        return _frozen(is_boundary)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the surface has no boundary."""
+        return not self.boundary_loops
+
+    @cached_property
+    def components(self) -> np.ndarray:
+        """The connected component of each vertex, (V,) int32, counted from 0 in the order of their first vertices."""
+        return _frozen(topology.vertex_components(self.faces, self.num_vertices))
+
+    @cached_property
+    def edge_lengths(self) -> np.ndarray:
+        """The length of each of the `edges`, (E,)."""
+        ends = self.vertices[self.edges]
+        return _frozen(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+
+    @property
+    def mesh_size(self) -> float:
+        """The mean edge length."""
+        return float(self.edge_lengths.mean())
+
+    @cached_property
+    def area(self) -> float:
+        """The total area."""
+        return float(face_areas(self.vertices, self.faces).sum())
+
+    @cached_property
+    def report(self) -> MeshReport:
+        """What the mesh is like and what was done to it; prints as a table."""
+        checked, lengths, angles = self._checked, self.edge_lengths, np.degrees(corner_angles(self.vertices, self.faces))
+        valences = np.bincount(self.edges.ravel(), minlength=self.num_vertices)
+        loops = tuple(len(loop) for loop in self.boundary_loops)
+        components = int(self.components.max()) + 1
+        euler_number = self.num_vertices - len(self.edges) + self.num_faces
+        return MeshReport(
+            vertices=self.num_vertices,
+            faces=self.num_faces,
+            edges=len(self.edges),
+            components=components,
+            boundary_loops=loops,
+            boundary_edges=sum(loops),
+            euler_number=euler_number,
+            genus=(2 * components - len(loops) - euler_number) // 2,
+            is_closed=self.is_closed,
+            area=self.area,
+            mesh_size=self.mesh_size,
+            min_edge=float(lengths.min()),
+            max_edge=float(lengths.max()),
+            min_angle=float(angles.min()),
+            max_angle=float(angles.max()),
+            min_valence=int(valences.min()),
+            max_valence=int(valences.max()),
+            mean_valence=float(valences.mean()),
+            vertices_in_file=len(self.welded_index),
+            faces_in_file=checked.faces_in_file,
+            welded_vertices=checked.welded_vertices,
+            dropped_vertices=int(np.sum(self.welded_index < 0)),
+            reoriented_faces=checked.reoriented_faces,
+            repairs=checked.repairs,
+        )
+
+    def pull(self, original_data: Any) -> np.ndarray:
+        """Data of this mesh's vertices (V, ...) from data of the vertices handed in (V_original, ...)."""
+        data = np.asarray(original_data)
+        self._expect_rows(data, len(self.welded_index), "vertices in the source")
+        return data[self.original_index]
+
+    def push(self, data: Any, fill: Any = np.nan) -> np.ndarray:
+        """Data of the vertices handed in (V_original, ...) from data of this mesh (V, ...).
+
+        Args:
+            data: (V, ...) one entry per vertex of this mesh.
+            fill: the value at vertices that were dropped.
+        """
+        data = np.asarray(data)
+        self._expect_rows(data, self.num_vertices, "vertices")
+        pushed = data[self.welded_index].astype(np.result_type(data.dtype, fill))
+        pushed[self.welded_index < 0] = fill
+        return pushed
+
+    @staticmethod
+    def _expect_rows(data: np.ndarray, count: int, what: str) -> None:
+        if data.ndim == 0 or len(data) != count:
+            raise ValueError(f"The data must have one entry for each of the {count} {what}, found the shape {data.shape}.")
+
+    def scaled(self, factor: float) -> "Mesh":
+        """The mesh with all positions multiplied by a positive factor; faces, indices and normals stay.
+
+        Raises:
+            MeshError: if the factor is not positive, or the result would be too large or too small to compute with.
+        """
+        factor = float(factor)
+        if not 0 < factor < np.inf:
+            raise MeshError(f"The factor must be positive and finite, found {factor}. A mirror image would face inwards.")
+        # Checked again, since a tiny factor can still underflow.
+        with np.errstate(over="ignore"):
+            vertices = self.vertices * factor
+        if not np.abs(vertices).max() <= LARGEST_LENGTH:
+            raise MeshError(f"Scaling by {factor:g} makes positions larger than {LARGEST_LENGTH:g}. Use a smaller factor.")
+        check(vertices, self.faces, repair=False, weld=False)
+        mesh = object.__new__(Mesh)
+        mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals)
+        return mesh
+
+    def __repr__(self) -> str:
+        boundary = "closed" if self.is_closed else f"{len(self.boundary_loops)} boundary loops"
+        return f"Mesh({self.num_vertices} vertices, {self.num_faces} faces, {boundary})"
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    """The array, read-only."""
+    array.setflags(write=False)
+    return array

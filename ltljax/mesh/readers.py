@@ -1,0 +1,236 @@
+"""How each file format spells vertices and faces.
+
+What enters: the path of an existing file. What leaves: `Polygons`, unchecked. Readers may raise anything; `files` turns
+it into a `MeshError`. A reader raises one itself where it knows better what is wrong.
+"""
+
+import io
+import json
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+import trimesh
+
+from .errors import MeshError
+
+
+class Polygons(NamedTuple):
+    """Vertices (V, 3) in the order of the file, and triangles (F, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def fan(polygons: Sequence[Sequence[int]]) -> np.ndarray:
+    """Triangles (F, 3) that fan out from the first corner of each polygon."""
+    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
+    if np.any(sizes < 3):
+        first = int(np.flatnonzero(sizes < 3)[0])
+        raise MeshError(f"face {first} has {sizes[first]} corners, but a face has at least three. Correct or remove it.")
+    corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
+    starts = np.cumsum(sizes) - sizes
+    start = np.repeat(starts, sizes - 2)
+    triangles = np.cumsum(sizes - 2)
+    step = np.arange(len(start)) - np.repeat(triangles - (sizes - 2), sizes - 2)
+    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+
+
+def read_obj(path: Path) -> Polygons:
+    """Wavefront OBJ: the ``v`` and ``f`` lines.
+
+    trimesh reads OBJ too, but with the eye of a renderer: it splits vertices at texture seams, drops those without a
+    face and regroups by material, so that the order of the file, which per-vertex data follow, is lost.
+    """
+    text = path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    coordinates: list[list[float]] = []
+    polygons: list[list[int]] = []
+    for number, line in enumerate(text.split("\n"), start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        try:
+            if words[0] == "v":
+                x, y, z = words[1:4]
+                coordinates.append([float(x), float(y), float(z)])
+            elif words[0] == "f":
+                # 7/1/3 is vertex 7 with a texture and a normal. Negative numbers count back from the latest vertex.
+                indices = [int(word.partition("/")[0]) for word in words[1:]]
+                latest = len(coordinates)
+                polygons.append([index - 1 if index >= 0 else latest + index for index in indices])
+        except ValueError:
+            raise MeshError(f"line {number} is not a vertex or a face: {line.strip()[:60]!r}. Correct or remove it.") from None
+    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(polygons))
+
+
+def read_ply(path: Path) -> Polygons:
+    """PLY, text or binary."""
+    return _polygons(trimesh.exchange.ply.load_ply(_stream(path), fix_texture=False, skip_materials=True))
+
+
+def read_stl(path: Path) -> Polygons:
+    """STL, text or binary; every triangle brings its own three vertices."""
+    return _polygons(trimesh.exchange.stl.load_stl(_stream(path)))
+
+
+def read_off(path: Path) -> Polygons:
+    """OFF."""
+    return _polygons(trimesh.exchange.off.load_off(_stream(path)))
+
+
+def read_glb(path: Path) -> Polygons:
+    """Binary glTF."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    _check_gltf(json.loads(data[20 : 20 + length].decode("utf-8")), path)
+    return _scene(trimesh.exchange.gltf.load_glb(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
+
+
+def read_gltf(path: Path) -> Polygons:
+    """Text glTF, with its buffers inside or beside it."""
+    data = path.read_bytes()
+    _check_gltf(json.loads(data.decode("utf-8")), path)
+    return _scene(trimesh.exchange.gltf.load_gltf(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
+
+
+def read_meshio(path: Path) -> Polygons:
+    """VTK, VTU and Gmsh: their triangles, quadrangles and polygons; of curved elements the corners."""
+    meshio = _extra("meshio", "io")
+    try:
+        grid = meshio.read(path)
+    except (Exception, SystemExit):
+        # Surfaces in legacy VTK files are mostly of the kind POLYDATA, which meshio does not read.
+        if path.suffix.lower() == ".vtk" and b"POLYDATA" in path.read_bytes()[:1000]:
+            return read_vtk(path)
+        raise
+    corners = {"triangle": 3, "quad": 4, "polygon": 0}
+    pieces = []
+    for block in grid.cells:
+        name = block.type.rstrip("0123456789")
+        if name in corners:
+            pieces.append(fan([list(cell)[: corners[name] or None] for cell in np.asarray(block.data).tolist()]))
+    if not pieces:
+        found = ", ".join(sorted({block.type for block in grid.cells})) or "nothing"
+        raise MeshError(f"expected triangles, found {found}. Extract the surface first, e.g. with pyvista or Gmsh.")
+    return Polygons(_in_space(np.asarray(grid.points)), np.concatenate(pieces))
+
+
+def read_vtk(path: Path) -> Polygons:
+    """VTK surfaces (POLYDATA), text, binary or XML."""
+    pyvista = _extra("pyvista", "viz")
+    surface = pyvista.read(path)
+    if not isinstance(surface, pyvista.PolyData):
+        raise MeshError(f"expected a surface (PolyData), found {type(surface).__name__}. Extract the surface first.")
+    triangles = surface.triangulate()
+    return Polygons(np.asarray(triangles.points), np.asarray(triangles.faces).reshape(-1, 4)[:, 1:])
+
+
+def read_gifti(path: Path) -> Polygons:
+    """GIfTI surfaces, as brain atlases use them."""
+    nibabel = _extra("nibabel", "io")
+    image = nibabel.load(path)
+    points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
+    triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
+    if not points or not triangles:
+        raise MeshError("expected a surface, found no points or no triangles. Choose the file that holds the geometry.")
+    return Polygons(np.asarray(points[0].data), np.asarray(triangles[0].data))
+
+
+READERS: dict[str, Callable[[Path], Polygons]] = {
+    "obj": read_obj,
+    "ply": read_ply,
+    "stl": read_stl,
+    "off": read_off,
+    "glb": read_glb,
+    "gltf": read_gltf,
+    "vtk": read_meshio,
+    "vtu": read_meshio,
+    "msh": read_meshio,
+    "vtp": read_vtk,
+    "gii": read_gifti,
+}
+
+
+def _stream(path: Path) -> io.BytesIO:
+    return io.BytesIO(path.read_bytes())
+
+
+def _resolver(path: Path) -> Any:
+    return trimesh.resolvers.FilePathResolver(str(path))
+
+
+def _extra(module: str, extra: str) -> Any:
+    """The optional module, or an error that names the extra to install."""
+    try:
+        return __import__(module)
+    except ImportError as error:
+        raise MeshError(f'reading this kind of file needs {module}. Install it with: pip install "ltljax[{extra}]"') from error
+
+
+def _in_space(points: np.ndarray) -> np.ndarray:
+    """Points (V, 3), with zeros added to plane ones (V, 2)."""
+    if points.ndim == 2 and points.shape[1] == 2:
+        return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    return points
+
+
+def _polygons(loaded: dict[str, Any]) -> Polygons:
+    """The geometry in what a trimesh reader returns: one mesh, or several by name."""
+    if "geometry" in loaded:
+        return _joined([_polygons(part) for part in loaded["geometry"].values()])
+    faces = loaded.get("faces")
+    if faces is None:
+        faces = np.zeros((0, 3), np.int64)
+    faces = np.asarray(faces)
+    if faces.ndim == 2 and faces.shape[1] != 3:
+        faces = fan(faces.tolist())
+    return Polygons(np.asarray(loaded["vertices"]), faces)
+
+
+def _joined(parts: list[Polygons]) -> Polygons:
+    """All parts in one numbering."""
+    if not parts:
+        return Polygons(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    counts = np.array([len(part.vertices) for part in parts])
+    faces = []
+    for part, count, shift in zip(parts, counts, np.cumsum(counts) - counts, strict=True):
+        indices = part.faces.astype(np.int64)
+        # An index beyond its own part must not reach into the next one.
+        faces.append(np.where((indices >= 0) & (indices < count), indices + shift, counts.sum()))
+    return Polygons(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+
+def _check_gltf(header: dict[str, Any], path: Path) -> None:
+    """Refuses what would be read wrongly, or at a size that the file does not back."""
+    for index, accessor in enumerate(header.get("accessors", [])):
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise MeshError(f"accessor {index} is compressed or sparse. Export the file without compression.")
+    for buffer in header.get("buffers", []):
+        uri = buffer.get("uri", "data:")
+        if not uri.startswith("data:") and not (path.parent / unquote(uri)).is_file():
+            raise MeshError(f"the buffer {uri[:80]!r} is missing. Put it beside the file, or export to GLB.")
+
+
+def _scene(loaded: dict[str, Any]) -> Polygons:
+    """The parts of a scene, each instance with its transform, in the order of the scene's nodes."""
+    geometry = loaded["geometry"]
+    nodes = {node["frame_to"]: node for node in loaded["graph"]}
+    placed = [node for node in loaded["graph"] if node.get("geometry") in geometry and "faces" in geometry[node["geometry"]]]
+    parts = []
+    for node in placed:
+        matrix, parent, depth = np.asarray(node["matrix"]), node["frame_from"], 0
+        while parent in nodes:
+            matrix, parent, depth = np.asarray(nodes[parent]["matrix"]) @ matrix, nodes[parent]["frame_from"], depth + 1
+            if depth > len(nodes):
+                raise MeshError("the scene's nodes contain each other in a circle. Export the file again.")
+        part = _polygons(geometry[node["geometry"]])
+        vertices = np.asarray(part.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        # A mirrored instance turns its faces inside out.
+        faces = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
+        parts.append(Polygons(vertices, faces))
+    if not parts:  # a file without a scene: its meshes as they are
+        return _joined([_polygons(part) for part in geometry.values() if "faces" in part])
+    return _joined(parts)

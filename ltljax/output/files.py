@@ -1,0 +1,64 @@
+"""Surfaces and their fields as files: VTK PolyData and time series for ParaView, PLY with colours."""
+
+import base64
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import trimesh
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
+    """Write a binary PLY with per-vertex colours (V, 4) of unsigned bytes."""
+    surface = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+    path.write_bytes(surface.export(file_type="ply"))
+
+
+def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[str, np.ndarray]) -> None:
+    """Write a VTK PolyData file (``.vtp``) with fields on the vertices, (V,) or (V, C).
+
+    XML with inline base64 arrays, which ParaView and every VTK reader open; written here so that results can be kept
+    where no VTK is installed.
+
+    Source: VTK file formats, section XML.
+    """
+    offsets = 3 * np.arange(1, len(faces) + 1)
+    point_data = "".join(_array(name, np.asarray(values)) for name, values in fields.items())
+    path.write_text(
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<PolyData><Piece NumberOfPoints="{len(vertices)}" NumberOfPolys="{len(faces)}" NumberOfVerts="0" '
+        'NumberOfLines="0" NumberOfStrips="0">\n'
+        f"<PointData>\n{point_data}</PointData>\n"
+        f"<Points>\n{_array('Points', vertices)}</Points>\n"
+        f"<Polys>\n{_array('connectivity', faces.ravel().astype(np.int64))}{_array('offsets', offsets)}</Polys>\n"
+        "</Piece></PolyData>\n</VTKFile>\n",
+        encoding="ascii",
+    )
+
+
+def write_series(path: Path, times: np.ndarray, files: list[str]) -> None:
+    """Write a ParaView collection (``.pvd``): one file, named relative to the collection, for each time."""
+    entries = "".join(
+        f'<DataSet timestep="{time:.17g}" file={quoteattr(file)}/>\n' for time, file in zip(times, files, strict=True)
+    )
+    path.write_text(
+        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n'
+        f"<Collection>\n{entries}</Collection>\n</VTKFile>\n",
+        encoding="ascii",
+    )
+
+
+_VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64"}
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    kind = _VTK_TYPES[values.dtype.str[1:]]
+    components = values.shape[1] if values.ndim == 2 else 1
+    # The header, the number of bytes that follow, is part of what is encoded.
+    data = base64.b64encode(np.uint64(values.nbytes).tobytes() + values.tobytes()).decode("ascii")
+    return (
+        f'<DataArray type="{kind}" Name={quoteattr(name)} NumberOfComponents="{components}" format="binary">'
+        f"{data}</DataArray>\n"
+    )

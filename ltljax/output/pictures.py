@@ -1,0 +1,85 @@
+"""Pictures and animations of a field on a surface, rendered off-screen by PyVista (the extra `viz`)."""
+
+import importlib.util
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+# From the front, a little from the right and from above; y is up, as in most mesh files.
+_VIEW = (0.55, 0.35, 1.0)
+_SIZE = (960, 720)
+_FRAMES_PER_SECOND = 20
+
+
+def can_draw() -> bool:
+    """Whether the picture extra is installed."""
+    return importlib.util.find_spec("pyvista") is not None
+
+
+class Picture:
+    """A surface with a colour-mapped field on it, drawn off-screen.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        title: the name of the field, beside the colour bar.
+        limits: the ends of the colour bar.
+        colormap: a name that matplotlib knows.
+    """
+
+    def __init__(
+        self, vertices: np.ndarray, faces: np.ndarray, title: str, limits: tuple[float, float], colormap: str = "viridis"
+    ):
+        import pyvista
+
+        self._surface = pyvista.PolyData.from_regular_faces(vertices, faces)
+        self._surface[title] = np.full(len(vertices), limits[0])
+        self._title = title
+        self._plotter = pyvista.Plotter(off_screen=True, window_size=list(_SIZE))
+        self._plotter.set_background("white")
+        self._plotter.add_mesh(
+            self._surface,
+            scalars=title,
+            clim=limits,
+            cmap=colormap,
+            smooth_shading=False,
+            interpolate_before_map=True,
+            specular=0.15,
+            scalar_bar_args=dict(title=title, color="black", vertical=True, position_x=0.9, position_y=0.25, height=0.5),
+        )
+        self._text = None
+        self._plotter.view_vector(_VIEW, viewup=(0, 1, 0))
+        self._plotter.camera.zoom(1.2)
+
+    def draw(self, values: np.ndarray, caption: str = "") -> np.ndarray:
+        """The picture (height, width, 3) of unsigned bytes of the field's values (V,)."""
+        self._surface[self._title] = values
+        if self._text is not None:
+            self._plotter.remove_actor(self._text)
+        self._text = self._plotter.add_text(caption, position="lower_left", font_size=11, color="black")
+        return np.asarray(self._plotter.screenshot(return_img=True))
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._plotter.close()
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write a picture as PNG."""
+    import imageio.v3
+
+    imageio.v3.imwrite(path, image)
+
+
+def write_animation(path: Path, images: Iterable[np.ndarray]) -> Path:
+    """Write pictures as an MP4, or as a GIF beside it where no encoder is installed; returns the file written."""
+    import imageio.v2
+
+    frames = list(images)
+    try:
+        imageio.v2.mimwrite(path, frames, fps=_FRAMES_PER_SECOND, quality=8)  # pyright: ignore[reportArgumentType]
+    except (ValueError, ImportError, OSError, RuntimeError):
+        path = path.with_suffix(".gif")
+        imageio.v2.mimwrite(path, frames, duration=1000 / _FRAMES_PER_SECOND, loop=0)  # pyright: ignore[reportArgumentType]
+    return path

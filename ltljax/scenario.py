@@ -1,0 +1,215 @@
+"""The paper's examples as scenarios: names and options become an equation, a mesh and an initial state.
+
+What enters: a name from `SCENARIOS` and `Options`. What leaves: a `Scenario`, ready to be solved.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
+from .mesh import Mesh, load_mesh, shapes
+
+BUILT_IN = ("sphere", "torus")
+SOURCES = ("angle", "angle-zero-mean", "sine")
+_MAJOR, _MINOR = 2.0, 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a user can choose about a scenario.
+
+    Attributes:
+        mesh: ``"sphere"``, ``"torus"`` or the path of a mesh file.
+        source: of `heat` on the torus, one of `SOURCES`.
+        as_published: of `turing`, the paper's parameters in place of those that make a pattern.
+        keep_scale: leave a mesh file's length scale alone.
+        repair: mend a mesh file that is not acceptable.
+        seed: of the random numbers.
+        t1: the end of the run; None for the scenario's own.
+    """
+
+    mesh: str = "sphere"
+    source: str | None = None
+    as_published: bool = False
+    keep_scale: bool = False
+    repair: bool = False
+    seed: int = 0
+    t1: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """An example, ready to be solved.
+
+    Attributes:
+        name: its name.
+        mesh: where; for files scaled as ``notes`` says.
+        make_equation: the equation, from the float type.
+        u0: the initial state.
+        t1: the end of the run.
+        parameters: every parameter, for the record.
+        species: the names of the state's columns.
+        shown: the column that pictures show.
+        exact: ``t -> state``, where the solution is known.
+        exact_is: what ``exact`` is, in words.
+        notes: what a reader of the results should know.
+    """
+
+    name: str
+    mesh: Mesh
+    make_equation: Callable[[Any], Equation]
+    u0: np.ndarray
+    t1: float
+    parameters: dict[str, Any]
+    species: tuple[str, ...]
+    shown: int = 0
+    exact: Callable[[float], np.ndarray] | None = None
+    exact_is: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def heat(options: Options) -> Scenario:
+    """u_t = Delta u + g from u = 0 (section 3): g = x1 on the sphere and on files, g of the poloidal angle on the torus."""
+    if options.mesh == "torus":
+        return _heat_on_torus(options)
+    if options.source is not None:
+        raise ValueError(f"--source {options.source} needs --mesh torus; elsewhere the source is x1.")
+    if options.mesh == "sphere":
+        mesh = shapes.icosphere(subdivisions=4)
+        x1 = mesh.vertices[:, 0]
+        return _diffusion(
+            options, mesh, x1, 5.0, "x1",
+            exact=lambda t: x1 * (1 - math.exp(-2 * t)) / 2,
+            exact_is="x1 (1 - exp(-2 t)) / 2, which tends to x1 / 2",
+        )  # fmt: skip
+    mesh, note = _from_file(options)
+    x1 = mesh.vertices[:, 0]
+    areas = _vertex_areas(mesh)
+    return _diffusion(
+        options, mesh, x1 - areas @ x1 / areas.sum(), 5.0, "x1 - mean(x1)",
+        notes=(note, "The mean of the source is taken off, so that a stationary state exists."),
+    )  # fmt: skip
+
+
+def _heat_on_torus(options: Options) -> Scenario:
+    source = options.source or "angle-zero-mean"
+    mesh = shapes.torus(major=_MAJOR, minor=_MINOR, n_major=96, n_minor=48)
+    angle = _poloidal_angle(mesh)
+    if source == "angle":
+        note = (
+            "As published, g = x has mean pi, so no stationary state exists: the mean of u grows like pi t, "
+            "and only the profile about the mean settles. See --source angle-zero-mean."
+        )
+        return _diffusion(options, mesh, angle, 10.0, "x, the poloidal angle in [0, 2 pi)", notes=(note,))
+    if source == "angle-zero-mean":
+        # At the jump of the angle the source takes the mean of its two sides.
+        values = np.where(angle == 0, 0.0, angle - np.pi)
+        note = "The stationary profile ranges over +-2.1257, at the angles 1.4814 and 4.8018."
+        return _diffusion(options, mesh, values, 10.0, "x - pi, x the poloidal angle", notes=(note,))
+    profile = _sine_profile(angle)
+    return _diffusion(
+        options, mesh, np.sin(angle), 10.0, "sin x, x the poloidal angle",
+        exact=lambda t: profile,
+        exact_is="the stationary profile (largest value 1.0330); the run approaches it like exp(-0.977 t)",
+    )  # fmt: skip
+
+
+def turing(options: Options) -> Scenario:
+    """The paper's reaction-diffusion system (section 4), by default with parameters that make spots."""
+    if options.source is not None:
+        raise ValueError("--source belongs to heat; turing has no source.")
+    note: tuple[str, ...] = ()
+    if options.mesh == "sphere":
+        mesh = shapes.icosphere(subdivisions=5)
+    elif options.mesh == "torus":
+        mesh = shapes.torus(major=_MAJOR, minor=_MINOR, n_major=144, n_minor=72)
+    else:
+        mesh, scale = _from_file(options)
+        note = (scale,)
+    if options.as_published:
+        reaction = dict(rate=2.0, feed=16.0, decay=0.0)
+        diffusivity, start, noise, t1 = (1.0, 2.0), 1.0, 0.0, 20.0
+        note += (
+            "The published parameters (alpha = 1, beta = s = 2, gamma = 0, start at 1) make no pattern: without gamma "
+            "no diffusivities can, so the state stays uniform and tends to (1, 16).",
+        )
+    else:
+        reaction = dict(rate=10.0, feed=16.0, decay=12.0)
+        diffusivity, start, noise, t1 = (0.8, 0.1), 4.0, 0.1, 40.0
+        note += ("Where v falls below 0.05 its sink fades to zero, which keeps v from turning negative.",)
+    rng = np.random.default_rng(options.seed)
+    decay = reaction["decay"] + noise * rng.uniform(-1, 1, mesh.num_vertices)
+
+    def make_equation(dtype) -> Equation:
+        return ReactionDiffusion(
+            diffusivity,
+            kinetics.turk(
+                rate=jnp.asarray(reaction["rate"], dtype),
+                feed=jnp.asarray(reaction["feed"], dtype),
+                decay=jnp.asarray(decay, dtype),
+            ),
+        )
+
+    return Scenario(
+        name="turing",
+        mesh=mesh,
+        make_equation=make_equation,
+        u0=np.full((mesh.num_vertices, 2), start),
+        t1=t1 if options.t1 is None else options.t1,
+        parameters=dict(diffusivity=diffusivity, **reaction, decay_noise=noise, start=start),
+        species=("u1", "u2"),
+        shown=1,
+        exact=(lambda t: np.broadcast_to([1.0, 16.0], (mesh.num_vertices, 2))) if options.as_published else None,
+        exact_is="(1, 16), the state the published parameters tend to" if options.as_published else "",
+        notes=note,
+    )
+
+
+SCENARIOS: dict[str, Callable[[Options], Scenario]] = {"heat": heat, "turing": turing}
+
+
+def _diffusion(options, mesh, source, t1, formula, *, exact=None, exact_is="", notes=()) -> Scenario:
+    return Scenario(
+        name="heat",
+        mesh=mesh,
+        make_equation=lambda dtype: Diffusion(jnp.asarray(1.0, dtype), jnp.asarray(source, dtype)),
+        u0=np.zeros(mesh.num_vertices),
+        t1=t1 if options.t1 is None else options.t1,
+        parameters=dict(diffusivity=1.0, source=formula),
+        species=("u",),
+        exact=exact,
+        exact_is=exact_is,
+        notes=notes,
+    )
+
+
+def _from_file(options: Options) -> tuple[Mesh, str]:
+    mesh = load_mesh(options.mesh, repair=options.repair)
+    if options.keep_scale:
+        return mesh, f"The mesh keeps its scale: area {mesh.area:.6g}."
+    factor = math.sqrt(4 * math.pi / mesh.area)
+    return mesh.scaled(factor), f"The mesh is scaled by {factor:.6g}, so that its area is that of the unit sphere."
+
+
+def _poloidal_angle(mesh: Mesh) -> np.ndarray:
+    x, y, z = mesh.vertices.T
+    return np.mod(np.arctan2(z, np.hypot(x, y) - _MAJOR), 2 * np.pi)
+
+
+def _sine_profile(angle: np.ndarray) -> np.ndarray:
+    """The stationary solution for g = sin x: (r^2/2) sin x + (a r/2) [x - 2 atan(sqrt((a - r)/(a + r)) tan(x/2))]."""
+    x = np.where(angle > np.pi, angle - 2 * np.pi, angle)
+    root = math.sqrt((_MAJOR - _MINOR) / (_MAJOR + _MINOR))
+    bracket = x - 2 * np.arctan2(root * np.sin(x / 2), np.cos(x / 2))
+    return _MINOR**2 / 2 * np.sin(x) + _MAJOR * _MINOR / 2 * bracket
+
+
+def _vertex_areas(mesh: Mesh) -> np.ndarray:
+    corners = mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    return np.bincount(mesh.faces.ravel(), np.repeat(areas / 3, 3), minlength=mesh.num_vertices)

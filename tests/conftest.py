@@ -1,0 +1,35 @@
+"""Strict JAX for every test: 64-bit, no silent promotion of dtype or rank, annotated shapes checked while running."""
+
+import os
+import tempfile
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+# A compilation cache that survives the run: compiling is most of what the tests spend.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "ltljax-tests-jax-cache"))
+
+with install_import_hook("ltljax", "beartype.beartype"):
+    import ltljax  # noqa: F401  (imported here first, so that the hook sees it)
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+MESHES = Path(__file__).parents[2] / "shared" / "meshes"
+
+
+@pytest.fixture
+def real_mesh():
+    """The path of a real mesh by name; tests that ask for it are skipped where the meshes are not at hand."""
+
+    def path(name: str) -> Path:
+        if not (MESHES / name).exists():
+            pytest.skip(f"the mesh {name} is not at hand")
+        return MESHES / name
+
+    return path
