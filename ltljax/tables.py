@@ -132,7 +132,7 @@ def _difference_sum(block: Block, weights: Array, u: Array) -> Array:
     centre = block.centre(u)
     trailing = (1,) * (u.ndim - 1)
     if weights.shape[0] > _UNROLL:
-        return jnp.sum(weights.reshape(*weights.shape, *trailing) * (block.neighbours(u) - centre), axis=0)
+        return jnp.sum(weights.reshape(*weights.shape, *trailing) * (block.neighbours(u) - centre[None]), axis=0)
     # Unrolled, the slots fuse into one pass over u with no (K, N) intermediate.
     total = jnp.zeros_like(centre)
     for slot in range(weights.shape[0]):

@@ -27,7 +27,8 @@ class Diffusion(Equation):
 
     def rate(self, t, surface: Surface, u):
         """The time derivative D Delta u + g."""
-        rate = jnp.asarray(self.diffusivity, u.dtype) * laplacian(surface, u)
+        diffusivity = jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
+        rate = diffusivity[None] * laplacian(surface, u)
         if self.source is None:
             return rate
         source = self.source(t, surface.vertices) if callable(self.source) else self.source

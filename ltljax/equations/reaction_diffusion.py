@@ -37,13 +37,13 @@ class ReactionDiffusion(Equation):
     def rate(self, t, surface: Surface, u):
         """The time derivative: diffusion of every species and the reaction at every vertex."""
         self._check(u)
-        return self.diffusivity.astype(u.dtype) * laplacian(surface, u) + self.reaction(u)
+        return self.diffusivity.astype(u.dtype)[None] * laplacian(surface, u) + self.reaction(u)
 
     def spectral_bound(self, t, surface: Surface, u):
         """The diffusion's bound plus the largest row sum of the reaction's Jacobian over the surface."""
         self._check(u)
         species = jnp.eye(u.shape[1], dtype=u.dtype)
-        columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit, u.shape),))[1] for unit in species]
+        columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in species]
         reaction = jnp.max(sum(jnp.abs(column) for column in columns))
         return jnp.max(self.diffusivity.astype(u.dtype)) * spectral_bound(surface) + reaction
 

@@ -13,7 +13,7 @@ def unit(vectors: Float[AnyArray, "*N 3"]) -> Float[AnyArray, "*N 3"]:
     xp = vectors.__array_namespace__()
     squared = xp.sum(vectors**2, axis=-1, keepdims=True)
     is_zero = squared == 0
-    return xp.where(is_zero, xp.eye(3, dtype=vectors.dtype)[2], vectors / xp.sqrt(xp.where(is_zero, 1, squared)))
+    return xp.where(is_zero, xp.broadcast_to(xp.eye(3, dtype=vectors.dtype)[2], vectors.shape), vectors / xp.sqrt(xp.where(is_zero, 1, squared)))
 
 
 def tangent_frames(normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 2 3"]:
@@ -50,8 +50,8 @@ def boundary_frames(
 
 
 def transport(
-    source: Float[AnyArray, "*N 3"], target: Float[AnyArray, "*N 3"], vectors: Float[AnyArray, "*N 3"]
-) -> Float[AnyArray, "*N 3"]:
+    source: Float[AnyArray, "*#N 3"], target: Float[AnyArray, "*#N 3"], vectors: Float[AnyArray, "*#N 3"]
+) -> Float[AnyArray, "*#N 3"]:
     """Parallel transport L of tangent vectors from the plane of normal ``source`` to the plane of normal ``target``.
 
     The shortest rotation that takes one normal to the other (Chen, Chi and Wu, arXiv 0907.1817, section 2). For X

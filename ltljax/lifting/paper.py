@@ -27,7 +27,7 @@ def gradient_weights(lifted: Float[AnyArray, "K N 2"], topology: RingTopology) -
     has_face &= squared_centroid > DEGENERATE**2 * xp.sum(a**2 + b**2, axis=-1)
     centroid_weight = xp.where(has_face, 1 / xp.where(has_face, squared_centroid, 1), 0)
     total = xp.sum(centroid_weight, axis=0)
-    face_weight = centroid_weight / xp.where(total > 0, total, 1) / xp.where(has_face, determinant, 1)
+    face_weight = centroid_weight / xp.where(total > 0, total, 1)[None] / xp.where(has_face, determinant, 1)
     to_a = face_weight[..., None] * xp.stack([b[..., 1], -b[..., 0]], axis=-1)
     to_b = face_weight[..., None] * xp.stack([-a[..., 1], a[..., 0]], axis=-1)
     # Corner b of face k sits in slot k + 1, so a slot collects from its own face and from the one before.

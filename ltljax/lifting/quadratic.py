@@ -34,7 +34,7 @@ def laplacian_weights(
     target = xp.array([0, 0, 0, 2, 2], lifted.dtype)
     c = xp.maximum(_least_norm(moments, weights, target), 0)
     residual = xp.linalg.norm(target[:, None] - _apply_moments(moments, c), axis=0) / xp.linalg.norm(target)
-    return c / scale**2, residual
+    return c / scale[None] ** 2, residual
 
 
 def gradient_weights(lifted: Float[AnyArray, "K N 2"]) -> Float[AnyArray, "K N 2"]:
@@ -45,7 +45,7 @@ def gradient_weights(lifted: Float[AnyArray, "K N 2"]) -> Float[AnyArray, "K N 2
     xp = lifted.__array_namespace__()
     moments, weights, scale = ring_moments(lifted, xp.zeros(lifted.shape[1], bool))
     along_x, along_y = (_least_norm(moments, weights, target) for target in xp.eye(2, 5, dtype=lifted.dtype))
-    return xp.stack([along_x, along_y], axis=-1) / scale[:, None]
+    return xp.stack([along_x, along_y], axis=-1) / scale[None, :, None]
 
 
 def refined_normals(offsets: Float[AnyArray, "K N 3"], normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 3"]:
@@ -72,9 +72,9 @@ def ring_moments(
     count = xp.maximum(xp.sum(is_used, axis=0), 1).astype(lifted.dtype)
     mean_square = xp.sum(squared, axis=0) / count
     scale = xp.sqrt(xp.where(mean_square > 0, mean_square, 1))
-    x, y = lifted[..., 0] / scale, lifted[..., 1] / scale
-    weights = xp.where(is_used, scale**2 / xp.where(is_used, squared, 1), 0)
-    return xp.stack([x, xp.where(is_boundary, 0, y), x * y, x**2, y**2]), weights, scale
+    x, y = lifted[..., 0] / scale[None], lifted[..., 1] / scale[None]
+    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0)
+    return xp.stack([x, xp.where(is_boundary[None], 0, y), x * y, x**2, y**2]), weights, scale
 
 
 def _apply_moments(moments, c):
@@ -83,7 +83,7 @@ def _apply_moments(moments, c):
 
 def moment_matrix(moments: Float[AnyArray, "5 K N"], weights: Float[AnyArray, "K N"]) -> Float[AnyArray, "5 5 N"]:
     """The matrix A W A^T of every row; a ring determines a quadratic where it has full rank."""
-    return moments.__array_namespace__().einsum("ikn,jkn->ijn", moments * weights, moments)
+    return moments.__array_namespace__().einsum("ikn,jkn->ijn", moments * weights[None], moments)
 
 
 def _least_norm(moments, weights, target):
@@ -94,7 +94,7 @@ def _least_norm(moments, weights, target):
     # Small enough for the refinement to restore full accuracy, large enough that a matrix without full rank (four
     # neighbours, a mirrored ring) does not magnify rounding.
     ridge = xp.where(trace > 0, xp.finfo(matrix.dtype).eps ** (2 / 3) * trace / 5, 1)
-    factor = _cholesky(matrix + ridge * xp.eye(5, dtype=matrix.dtype)[:, :, None])
+    factor = _cholesky(matrix + ridge[None, None] * xp.eye(5, dtype=matrix.dtype)[:, :, None])
     c = xp.zeros_like(weights)
     for _ in range(1 + _REFINEMENTS):
         multiplier = _substitute(factor, target[:, None] - _apply_moments(moments, c))

@@ -29,17 +29,19 @@ class RingTopology(eqx.Module):
         """The slot after each slot; the slot itself where no face follows, so that such a face has no area."""
         xp = self.valences.__array_namespace__()
         slot = xp.arange(num_slots, dtype=self.valences.dtype)[:, None]
-        wrapped = xp.where(self.is_boundary, slot, 0)
-        return xp.where(slot + 1 < self.valences, slot + 1, xp.where(slot < self.valences, wrapped, slot))
+        valences = self.valences[None]
+        wrapped = xp.where(self.is_boundary[None], slot, 0)
+        return xp.where(slot + 1 < valences, slot + 1, xp.where(slot < valences, wrapped, slot))
 
     def preceding(self, num_slots: int) -> Int[AnyArray, "K N"]:
         """The slot before each slot, around the ring; empty slots keep to themselves."""
         xp = self.valences.__array_namespace__()
         slot = xp.arange(num_slots, dtype=self.valences.dtype)[:, None]
-        return xp.where(slot < self.valences, xp.where(slot > 0, slot - 1, self.valences - 1), slot)
+        valences = self.valences[None]
+        return xp.where(slot < valences, xp.where(slot > 0, slot - 1, valences - 1), slot)
 
 
-def take_slots(values: Float[AnyArray, "K N *C"], slots: Int[AnyArray, "K N"]) -> Float[AnyArray, "K N *C"]:
+def take_slots(values: Float[AnyArray, "K N *C"], slots: Int[AnyArray, "J N"]) -> Float[AnyArray, "J N *C"]:
     """Each row's values in the order of ``slots``."""
     index = slots.reshape(*slots.shape, *(1,) * (values.ndim - 2))
     return values.__array_namespace__().take_along_axis(values, index, axis=0)
@@ -47,7 +49,8 @@ def take_slots(values: Float[AnyArray, "K N *C"], slots: Int[AnyArray, "K N"]) -
 
 def last_slot(values: Float[AnyArray, "K N C"], topology: RingTopology) -> Float[AnyArray, "N C"]:
     """Each row's value in its last used slot."""
-    return take_slots(values, (topology.valences - (topology.valences > 0))[None])[0]
+    last = (topology.valences - 1).clip(0)
+    return take_slots(values, last[None])[0]
 
 
 def centroid_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) -> Float[AnyArray, "N 3"]:

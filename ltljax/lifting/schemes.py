@@ -107,7 +107,7 @@ def ring_normals(vertices: Float[AnyArray, "V 3"], ring: Table, ring_blocks: tup
 
 def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
     """The neighbours of a block's rows, seen from their vertex."""
-    return block.neighbours(vertices) - block.centre(vertices)
+    return block.neighbours(vertices) - block.centre(vertices)[None]
 
 
 def fitted_normals(vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table) -> Float[AnyArray, "V 3"]:
@@ -201,5 +201,5 @@ def _vertex_areas(vertices, topology):
     return topology.ring.map(area, topology.ring_blocks)
 
 
-def _by_component(weights: list[Float[AnyArray, "K N 2"]]) -> tuple[PerBlock, PerBlock]:
+def _by_component(weights: list[Float[AnyArray, "_ _ 2"]]) -> tuple[PerBlock, PerBlock]:
     return tuple(w[..., 0] for w in weights), tuple(w[..., 1] for w in weights)

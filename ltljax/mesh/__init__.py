@@ -1,7 +1,7 @@
 """Meshes: a file or arrays become a checked surface.
 
 What enters: a mesh file, arrays, or the sizes of a built-in shape. What leaves: a `Mesh`, its report, and the index
-arrays of its topology. Every error that a mesh can cause is raised here. NumPy and SciPy only; nothing runs on a device.
+arrays of its topology. Every error that a mesh can cause is raised here. Nothing in this room runs on a device.
 """
 
 from . import shapes

@@ -12,12 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from .errors import MeshError
-from .report import face_areas
-from .topology import half_edges, undirected_keys
+from .orientation import turned_faces
+from .report import face_areas, face_edge_lengths
+from .topology import components, half_edges, shared_edges, undirected_keys, used_vertices
 
 # Weights go with the fourth power of lengths; within this range they, and products of two, stay finite in float64.
 LARGEST_LENGTH, SMALLEST_LENGTH = 1e60, 1e-60
@@ -83,13 +82,13 @@ def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
         again.check_edges()
         again.check_fans()
         again.check_components()
-    used, compact = np.unique(work.faces, return_inverse=True)
+    used = used_vertices(work.faces, len(work.vertices))
     new_index = np.full(len(work.vertices), -1, dtype=np.int64)
     new_index[used] = np.arange(len(used))
     welded_index = np.where(representative >= 0, new_index[representative], -1)
     return Checked(
         vertices=work.vertices[used],
-        faces=compact.reshape(work.faces.shape).astype(np.int32),
+        faces=new_index[work.faces].astype(np.int32),
         original_index=work.origin[used],
         welded_index=welded_index,
         faces_in_file=len(faces),
@@ -114,7 +113,8 @@ def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
         )
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(
-            f"Vertices must have the shape (V, 3), found {vertices.shape}. A plane mesh needs a third coordinate of zeros."
+            f"Vertices must have the shape (V, 3), found {vertices.shape}. "
+            "A plane mesh needs a third coordinate of zeros."
         )
     if faces.dtype.kind not in "iu":
         raise MeshError(f"Faces must be integers, found {faces.dtype}. Convert them with faces.astype(int).")
@@ -157,7 +157,7 @@ class _Workpiece:
             index = corners[(corners < 0) | (corners >= num_vertices)][0]
             return (
                 f"Face {face} refers to vertex {index}, but there are {num_vertices} vertices, counted from 0. "
-                "Correct the index (formats that count from 1 need 1 subtracted), or use repair=True to drop such faces."
+                "Correct the index (subtract 1 if the source counts from 1), or use repair=True to drop such faces."
             )
 
         is_bad = np.any((self.faces < 0) | (self.faces >= num_vertices), axis=1)
@@ -165,7 +165,7 @@ class _Workpiece:
 
     def check_positions(self) -> None:
         """The positions in use are finite, and of a size whose powers are finite too."""
-        is_finite = np.isfinite(self.vertices).all(axis=1)
+        is_finite = np.all(np.isfinite(self.vertices), axis=1)
 
         def not_finite(face: int) -> str:
             # The first vertex is named, not the first face, since that is what must be corrected.
@@ -176,9 +176,9 @@ class _Workpiece:
                 "Correct it, or use repair=True to drop the faces around it."
             )
 
-        self._drop(~is_finite[self.faces].all(axis=1), not_finite, "with a position that is not finite")
+        self._drop(~np.all(is_finite[self.faces], axis=1), not_finite, "with a position that is not finite")
         with np.errstate(invalid="ignore"):
-            is_moderate = (np.abs(self.vertices) <= LARGEST_LENGTH).all(axis=1)
+            is_moderate = np.all(np.abs(self.vertices) <= LARGEST_LENGTH, axis=1)
 
         def too_large(face: int) -> str:
             vertex = int(np.unique(self.faces[~is_moderate[self.faces]])[0])
@@ -188,13 +188,13 @@ class _Workpiece:
                 "overflow. Scale the mesh, or use repair=True to drop the faces around it."
             )
 
-        self._drop(~is_moderate[self.faces].all(axis=1), too_large, "with a position too large to compute with")
+        self._drop(~np.all(is_moderate[self.faces], axis=1), too_large, "with a position too large to compute with")
         # Minus zero and zero are one position.
         self.vertices = self.vertices + 0.0
 
     def merge_vertices(self, weld: bool) -> np.ndarray:
-        """Lets faces refer to the first of the vertices at each position; returns that vertex, or -1 if unused, (V,)."""
-        used = np.unique(self.faces)
+        """Lets faces refer to the first of the vertices at each position; returns it, or -1 where unused, (V,)."""
+        used = used_vertices(self.faces, len(self.vertices))
         representative = np.full(len(self.vertices), -1, dtype=np.int64)
         representative[used] = used
         if weld:
@@ -218,7 +218,7 @@ class _Workpiece:
             )
 
         self._drop(repeats, repeated, "with fewer than three different corners")
-        longest = self._edge_lengths().max(axis=1)
+        longest = face_edge_lengths(self.vertices, self.faces).max(axis=1)
 
         def too_small(face: int) -> str:
             return (
@@ -229,7 +229,7 @@ class _Workpiece:
         # A face with three corners at one place is thin rather than small.
         is_small = (longest < SMALLEST_LENGTH) & (longest > 0)
         self._drop(is_small, too_small, "too small to compute with")
-        longest = self._edge_lengths().max(axis=1)
+        longest = face_edge_lengths(self.vertices, self.faces).max(axis=1)
         areas = face_areas(self.vertices, self.faces)
 
         def no_area(face: int) -> str:
@@ -239,10 +239,6 @@ class _Workpiece:
             )
 
         self._drop(~(areas > THINNEST_FACE * longest**2), no_area, "without area")
-
-    def _edge_lengths(self) -> np.ndarray:
-        corners = self.vertices[self.faces]
-        return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
 
     def check_duplicates(self) -> None:
         """No two faces have the same three vertices."""
@@ -283,25 +279,16 @@ class _Workpiece:
 
         self._drop(is_bad, message, "at edges that had more than two (the two largest stay)")
 
-    def _shared_edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The pairs of half-edges that share an edge, (N,) each, and whether both run the same way."""
-        directed = half_edges(self.faces)
-        keys = undirected_keys(directed, len(self.vertices))
-        order = np.argsort(keys, kind="stable")
-        pairs = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-        one, other = order[pairs], order[pairs + 1]
-        return one, other, directed[one, 0] == directed[other, 0]
-
     def check_fans(self) -> None:
         """The faces at each vertex form one fan; splitting gives every further fan a vertex of its own."""
         num_faces = len(self.faces)
-        one, other, same_way = self._shared_edges()
+        one, other, same_way = shared_edges(self.faces, len(self.vertices))
         # Corner j of face f is 3 f + j. A half-edge of block j runs from corner j to corner j + 1 of its face.
         begin, end = 3 * (one % num_faces) + one // num_faces, 3 * (one % num_faces) + (one // num_faces + 1) % 3
         first = 3 * (other % num_faces) + other // num_faces
         last = 3 * (other % num_faces) + (other // num_faces + 1) % 3
-        links = np.concatenate([begin, end]), np.concatenate([np.where(same_way, first, last), np.where(same_way, last, first)])
-        fans = _components(links, 3 * num_faces)
+        across = np.concatenate([np.where(same_way, first, last), np.where(same_way, last, first)])
+        fans = components(np.concatenate([begin, end]), across, 3 * num_faces)
         corners = self.faces.ravel()
         order = np.lexsort((fans, corners))
         begins = np.ones(len(order), bool)
@@ -315,8 +302,8 @@ class _Workpiece:
         if not self.repair:
             count = int(np.sum(fan_vertices == split[0]))
             raise MeshError(
-                f"The faces at vertex {split[0]} form {count} fans that touch only there, so the surface is not a manifold "
-                "at it. Give each fan a vertex of its own, or use repair=True to split it."
+                f"The faces at vertex {split[0]} form {count} fans that touch only there, so the surface is not a "
+                "manifold at it. Give each fan a vertex of its own, or use repair=True to split it."
             )
         names = fan_vertices.copy()
         names[is_further] = len(self.vertices) + np.arange(is_further.sum())
@@ -331,8 +318,8 @@ class _Workpiece:
     def check_components(self) -> None:
         """Every connected component has enough vertices."""
         edges = half_edges(self.faces)
-        labels = _components((edges[:, 0], edges[:, 1]), len(self.vertices))
-        used = np.unique(self.faces)
+        labels = components(edges[:, 0], edges[:, 1], len(self.vertices))
+        used = used_vertices(self.faces, len(self.vertices))
         sizes = np.bincount(labels[used], minlength=labels.max() + 1)
         face_sizes = sizes[labels[self.faces[:, 0]]]
 
@@ -347,59 +334,6 @@ class _Workpiece:
 
     def orient(self) -> int:
         """Turns faces over until all agree with their neighbours and closed components face out; returns how many."""
-        num_faces = len(self.faces)
-        one, other, same_way = self._shared_edges()
-        f, g = one % num_faces, other % num_faces
-        # The orientation double cover: every face twice, once as given and once turned over. Neighbours that agree are
-        # linked as they are, others crosswise. A component is orientable when its two copies stay apart.
-        crossed = np.where(same_way, num_faces, 0)
-        links = np.concatenate([f, f + num_faces]), np.concatenate([g + crossed, g + num_faces - crossed])
-        labels = _components(links, 2 * num_faces)
-        given, turned = labels[:num_faces], labels[num_faces:]
-        if np.any(given == turned):
-            raise MeshError(self._non_orientable(f, g, same_way, given == turned))
-        _, component = np.unique(np.minimum(given, turned), return_inverse=True)
-        is_turned = given > turned
-        minority = np.bincount(component, is_turned) * 2 > np.bincount(component)
-        is_turned ^= minority[component]
-        is_closed = np.bincount(component, minlength=len(minority)) * 3 == 2 * np.bincount(component[f], minlength=len(minority))
-        is_turned ^= (is_closed & (self._volumes(component, is_turned) < 0))[component]
+        is_turned = turned_faces(self.vertices, self.faces)
         self.faces = np.where(is_turned[:, None], self.faces[:, [0, 2, 1]], self.faces)
         return int(is_turned.sum())
-
-    def _volumes(self, component: np.ndarray, is_turned: np.ndarray) -> np.ndarray:
-        """Six times the signed volume of each component with some of its faces turned over."""
-        corners = self.vertices[self.faces]
-        counts = np.bincount(component)
-        # About the component's own middle, or a far away origin would cancel the digits.
-        middle = np.stack([np.bincount(component, x) for x in corners.mean(axis=1).T], axis=1) / counts[:, None]
-        first, second, third = np.moveaxis(corners - middle[component, None], 1, 0)
-        volumes = np.sum(first * np.cross(second, third), axis=1)
-        return np.bincount(component, np.where(is_turned, -volumes, volumes))
-
-    def _non_orientable(self, f: np.ndarray, g: np.ndarray, same_way: np.ndarray, is_bad: np.ndarray) -> str:
-        """The message, with an edge across which no choice of orientations agrees once the others do."""
-        num_faces = len(self.faces)
-        # Agreement along a spanning tree fixes all orientations; the edges left over then tell.
-        weights = sparse.coo_array((np.arange(1, len(f) + 1), (f, g)), shape=(num_faces, num_faces))
-        tree = csgraph.minimum_spanning_tree(weights.tocsr()).tocoo()
-        edge = tree.data.astype(np.int64) - 1
-        crossed = np.where(same_way[edge], num_faces, 0)
-        links = np.concatenate([f[edge], f[edge] + num_faces]), np.concatenate(
-            [g[edge] + crossed, g[edge] + num_faces - crossed]
-        )
-        labels = _components(links, 2 * num_faces)
-        is_turned = labels[:num_faces] > labels[num_faces:]
-        fails = is_bad[f] & (same_way ^ is_turned[f] ^ is_turned[g])
-        where = int(np.flatnonzero(fails)[0])
-        shared = np.intersect1d(self.faces[f[where]], self.faces[g[where]])
-        return (
-            f"The surface is not orientable: once all other faces agree, those at edge {tuple(shared.tolist()[:2])} "
-            "do not (a Moebius strip or a Klein bottle). Cut it along a curve through that edge; repair cannot do this."
-        )
-
-
-def _components(links: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
-    """The component label of each of ``count`` nodes under the links."""
-    graph = sparse.coo_array((np.ones(len(links[0]), np.int8), links), shape=(count, count))
-    return csgraph.connected_components(graph.tocsr(), directed=False)[1]

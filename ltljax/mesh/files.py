@@ -1,7 +1,7 @@
 """A mesh file becomes a checked mesh.
 
-What enters: a path. What leaves: a `Mesh`, or a `MeshError` that begins with the file's name. The formats themselves are
-read in `readers`; here their failures are turned into sentences.
+What enters: a path. What leaves: a `Mesh`, or a `MeshError` that begins with the file's name. The formats themselves
+are read in `readers`; here their failures are turned into sentences.
 """
 
 import contextlib
@@ -64,8 +64,8 @@ def _read(path: Path) -> Polygons:
             return READERS[kind](path)
     except MeshError:
         raise
-    # Readers of other projects meet damaged files with any exception there is, some even by leaving the program. This is
-    # the one place where all of them mean the same: the file cannot be read.
+    # Readers of other projects meet damaged files with any exception there is, some even by leaving the program. This
+    # is the one place where all of them mean the same: the file cannot be read.
     except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
         raise MeshError(

@@ -28,7 +28,7 @@ def random_sphere(num_vertices: int = 2562, seed: int = 0) -> Mesh:
     return _hull_sphere(np.random.default_rng(seed).normal(size=(num_vertices, 3)))
 
 
-def jittered_sphere(subdivisions: int = 4, amount: float = 0.5, seed: int = 0) -> Mesh:
+def jittered_sphere(subdivisions: int = 4, amount: float | int = 0.5, seed: int = 0) -> Mesh:
     """The unit icosphere with its vertices moved at random along the sphere, joined afresh by their convex hull.
 
     Args:
@@ -42,7 +42,12 @@ def jittered_sphere(subdivisions: int = 4, amount: float = 0.5, seed: int = 0) -
 
 
 def jittered_torus(
-    n_major: int = 96, n_minor: int = 48, amount: float = 0.3, seed: int = 0, major: float = 2.0, minor: float = 1.0
+    n_major: int = 96,
+    n_minor: int = 48,
+    amount: float | int = 0.3,
+    seed: int = 0,
+    major: float | int = 2.0,
+    minor: float | int = 1.0,
 ) -> Mesh:
     """The torus of `shapes.torus` with both angles of every vertex moved at random; the faces stay.
 
@@ -65,7 +70,7 @@ def jittered_torus(
 
 
 def jittered(
-    mesh: Mesh, amount: float = 0.25, seed: int = 0, project: Callable[[np.ndarray], np.ndarray] | None = None
+    mesh: Mesh, amount: float | int = 0.25, seed: int = 0, project: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> Mesh:
     """The mesh with every inner vertex moved at random in its tangent plane; the faces and the boundary stay.
 

@@ -30,7 +30,7 @@ def grid_faces(num_rows: int, num_columns: int, *, wrap_rows: bool, wrap_columns
     return np.stack([corner, down, across, corner, across, side], axis=-1).reshape(-1, 3)
 
 
-def torus_points(x: np.ndarray, y: np.ndarray, major: float, minor: float) -> tuple[np.ndarray, np.ndarray]:
+def torus_points(x: np.ndarray, y: np.ndarray, major: float | int, minor: float | int) -> tuple[np.ndarray, np.ndarray]:
     """Positions and unit normals, (V, 3) each, of a torus at angles x around the tube and y around the axis, (V,)."""
     major, minor = positive("major", major), positive("minor", minor)
     if minor >= major:

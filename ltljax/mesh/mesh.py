@@ -1,7 +1,7 @@
 """`Mesh`: a triangle mesh that has passed every check.
 
-What enters: vertices and faces, by hand, from a shape or from a file. What leaves: an immutable record whose faces are a
-manifold, consistently oriented surface, so that no later room needs to ask.
+What enters: vertices and faces, by hand, from a shape or from a file. What leaves: an immutable record whose faces are
+a manifold, consistently oriented surface, so that no later room needs to ask.
 """
 
 import dataclasses
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from . import topology
-from .checks import LARGEST_LENGTH, Checked, check
+from .checks import LARGEST_LENGTH, SMALLEST_LENGTH, Checked, check
 from .errors import MeshError
-from .report import MeshReport, corner_angles, face_areas
+from .report import MeshReport, corner_angles, face_areas, face_edge_lengths
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -56,17 +56,18 @@ class Mesh:
             MeshError: if the arrays are not a surface; the message names the first offending index.
         """
         checked = check(vertices, faces, repair=repair, weld=weld)
+        unit_normals = None
         if normals is not None:
-            normals = np.array(normals, dtype=np.float64)
+            unit_normals = np.array(normals, dtype=np.float64)
             expected = (len(checked.welded_index), 3)
-            if normals.shape != expected:
-                raise MeshError(f"Normals must have the shape of the vertices, {expected}, found {normals.shape}.")
-            normals = normals[checked.original_index]
-            is_bad = ~(np.abs(np.linalg.norm(normals, axis=1) - 1) < 1e-6)
+            if unit_normals.shape != expected:
+                raise MeshError(f"Normals must have the shape of the vertices, {expected}, found {unit_normals.shape}.")
+            unit_normals = unit_normals[checked.original_index]
+            is_bad = ~(np.abs(np.linalg.norm(unit_normals, axis=1) - 1) < 1e-6)
             if is_bad.any():
                 first = int(checked.original_index[np.flatnonzero(is_bad)[0]])
                 raise MeshError(f"Normals must have length 1, but the one at vertex {first} has not. Normalise them.")
-        self._fill(checked, normals)
+        self._fill(checked, unit_normals)
 
     def _fill(self, checked: Checked, normals: np.ndarray | None) -> None:
         """Sets the fields, once, and makes their arrays read-only."""
@@ -140,7 +141,8 @@ class Mesh:
     @cached_property
     def report(self) -> MeshReport:
         """What the mesh is like and what was done to it; prints as a table."""
-        checked, lengths, angles = self._checked, self.edge_lengths, np.degrees(corner_angles(self.vertices, self.faces))
+        checked, lengths = self._checked, self.edge_lengths
+        angles = np.degrees(corner_angles(self.vertices, self.faces))
         valences = np.bincount(self.edges.ravel(), minlength=self.num_vertices)
         loops = tuple(len(loop) for loop in self.boundary_loops)
         components = int(self.components.max()) + 1
@@ -194,9 +196,9 @@ class Mesh:
     @staticmethod
     def _expect_rows(data: np.ndarray, count: int, what: str) -> None:
         if data.ndim == 0 or len(data) != count:
-            raise ValueError(f"The data must have one entry for each of the {count} {what}, found the shape {data.shape}.")
+            raise ValueError(f"The data must have one entry for each of {count} {what}, found the shape {data.shape}.")
 
-    def scaled(self, factor: float) -> "Mesh":
+    def scaled(self, factor: float | int) -> "Mesh":
         """The mesh with all positions multiplied by a positive factor; faces, indices and normals stay.
 
         Raises:
@@ -204,13 +206,16 @@ class Mesh:
         """
         factor = float(factor)
         if not 0 < factor < np.inf:
-            raise MeshError(f"The factor must be positive and finite, found {factor}. A mirror image would face inwards.")
-        # Checked again, since a tiny factor can still underflow.
+            raise MeshError(f"The factor must be positive and finite, found {factor}. A mirror image faces inwards.")
         with np.errstate(over="ignore"):
             vertices = self.vertices * factor
-        if not np.abs(vertices).max() <= LARGEST_LENGTH:
-            raise MeshError(f"Scaling by {factor:g} makes positions larger than {LARGEST_LENGTH:g}. Use a smaller factor.")
-        check(vertices, self.faces, repair=False, weld=False)
+            smallest = float(face_edge_lengths(self.vertices, self.faces).max(axis=1).min()) * factor
+        largest = float(np.abs(vertices).max())
+        if not (largest <= LARGEST_LENGTH and smallest >= SMALLEST_LENGTH):
+            raise MeshError(
+                f"Scaling by {factor:g} makes faces of size {smallest:g} and positions of size {largest:g}; areas and "
+                f"weights need {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}. Use a factor closer to 1."
+            )
         mesh = object.__new__(Mesh)
         mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals)
         return mesh

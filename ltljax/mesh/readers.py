@@ -2,6 +2,8 @@
 
 What enters: the path of an existing file. What leaves: `Polygons`, unchecked. Readers may raise anything; `files` turns
 it into a `MeshError`. A reader raises one itself where it knows better what is wrong.
+
+Other packages are imported where they are used: who computes on a built-in shape need not wait for them.
 """
 
 import io
@@ -13,7 +15,6 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
-import trimesh
 
 from .errors import MeshError
 
@@ -25,18 +26,20 @@ class Polygons(NamedTuple):
     faces: np.ndarray
 
 
-def fan(polygons: Sequence[Sequence[int]]) -> np.ndarray:
-    """Triangles (F, 3) that fan out from the first corner of each polygon."""
-    sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    if np.any(sizes < 3):
-        first = int(np.flatnonzero(sizes < 3)[0])
-        raise MeshError(f"face {first} has {sizes[first]} corners, but a face has at least three. Correct or remove it.")
-    corners = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
-    starts = np.cumsum(sizes) - sizes
-    start = np.repeat(starts, sizes - 2)
-    triangles = np.cumsum(sizes - 2)
-    step = np.arange(len(start)) - np.repeat(triangles - (sizes - 2), sizes - 2)
-    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+def fan(corners: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+    """Triangles (F, 3) that fan out from the first corner of each polygon.
+
+    Args:
+        corners: the corners of all polygons, one after the other.
+        sizes: the number of corners of each polygon.
+    """
+    flat, counts = np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
+    if np.any(counts < 3):
+        first = int(np.flatnonzero(counts < 3)[0])
+        raise MeshError(f"face {first} has {counts[first]} corners; it needs at least three. Correct or remove it.")
+    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    return np.stack([flat[start], flat[start + step + 1], flat[start + step + 2]], axis=1)
 
 
 def read_obj(path: Path) -> Polygons:
@@ -46,8 +49,10 @@ def read_obj(path: Path) -> Polygons:
     face and regroups by material, so that the order of the file, which per-vertex data follow, is lost.
     """
     text = path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    coordinates: list[list[float]] = []
-    polygons: list[list[int]] = []
+    # Flat lists: a million small ones would keep the garbage collector busy for longer than the reading takes.
+    coordinates: list[float] = []
+    corners: list[int] = []
+    sizes: list[int] = []
     for number, line in enumerate(text.split("\n"), start=1):
         words = line.partition("#")[0].split()
         if not words:
@@ -55,45 +60,56 @@ def read_obj(path: Path) -> Polygons:
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
-                coordinates.append([float(x), float(y), float(z)])
+                coordinates += (float(x), float(y), float(z))
             elif words[0] == "f":
                 # 7/1/3 is vertex 7 with a texture and a normal. Negative numbers count back from the latest vertex.
                 indices = [int(word.partition("/")[0]) for word in words[1:]]
-                latest = len(coordinates)
-                polygons.append([index - 1 if index >= 0 else latest + index for index in indices])
+                latest = len(coordinates) // 3
+                corners += [index - 1 if index >= 0 else latest + index for index in indices]
+                sizes.append(len(indices))
         except ValueError:
-            raise MeshError(f"line {number} is not a vertex or a face: {line.strip()[:60]!r}. Correct or remove it.") from None
-    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(polygons))
+            raise MeshError(f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it.") from None
+    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(corners, sizes))
 
 
 def read_ply(path: Path) -> Polygons:
     """PLY, text or binary."""
-    return _polygons(trimesh.exchange.ply.load_ply(_stream(path), fix_texture=False, skip_materials=True))
+    from trimesh.exchange.ply import load_ply
+
+    return _polygons(load_ply(_stream(path), fix_texture=False, skip_materials=True))
 
 
 def read_stl(path: Path) -> Polygons:
     """STL, text or binary; every triangle brings its own three vertices."""
-    return _polygons(trimesh.exchange.stl.load_stl(_stream(path)))
+    from trimesh.exchange.stl import load_stl
+
+    return _polygons(load_stl(_stream(path)))
 
 
 def read_off(path: Path) -> Polygons:
     """OFF."""
-    return _polygons(trimesh.exchange.off.load_off(_stream(path)))
+    from trimesh.exchange.off import load_off
+
+    return _polygons(load_off(_stream(path)))
 
 
 def read_glb(path: Path) -> Polygons:
     """Binary glTF."""
+    from trimesh.exchange.gltf import load_glb
+
     data = path.read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
     _check_gltf(json.loads(data[20 : 20 + length].decode("utf-8")), path)
-    return _scene(trimesh.exchange.gltf.load_glb(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
+    return _scene(load_glb(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
 
 
 def read_gltf(path: Path) -> Polygons:
     """Text glTF, with its buffers inside or beside it."""
+    from trimesh.exchange.gltf import load_gltf
+
     data = path.read_bytes()
     _check_gltf(json.loads(data.decode("utf-8")), path)
-    return _scene(trimesh.exchange.gltf.load_gltf(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
+    return _scene(load_gltf(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
 
 
 def read_meshio(path: Path) -> Polygons:
@@ -111,7 +127,8 @@ def read_meshio(path: Path) -> Polygons:
     for block in grid.cells:
         name = block.type.rstrip("0123456789")
         if name in corners:
-            pieces.append(fan([list(cell)[: corners[name] or None] for cell in np.asarray(block.data).tolist()]))
+            cells = [list(cell)[: corners[name] or None] for cell in np.asarray(block.data).tolist()]
+            pieces.append(fan([corner for cell in cells for corner in cell], [len(cell) for cell in cells]))
     if not pieces:
         found = ", ".join(sorted({block.type for block in grid.cells})) or "nothing"
         raise MeshError(f"expected triangles, found {found}. Extract the surface first, e.g. with pyvista or Gmsh.")
@@ -159,7 +176,9 @@ def _stream(path: Path) -> io.BytesIO:
 
 
 def _resolver(path: Path) -> Any:
-    return trimesh.resolvers.FilePathResolver(str(path))
+    from trimesh.resolvers import FilePathResolver
+
+    return FilePathResolver(str(path))
 
 
 def _extra(module: str, extra: str) -> Any:
@@ -167,7 +186,7 @@ def _extra(module: str, extra: str) -> Any:
     try:
         return __import__(module)
     except ImportError as error:
-        raise MeshError(f'reading this kind of file needs {module}. Install it with: pip install "ltljax[{extra}]"') from error
+        raise MeshError(f'reading this kind of file needs {module}. Run: pip install "ltljax[{extra}]"') from error
 
 
 def _in_space(points: np.ndarray) -> np.ndarray:
@@ -186,7 +205,7 @@ def _polygons(loaded: dict[str, Any]) -> Polygons:
         faces = np.zeros((0, 3), np.int64)
     faces = np.asarray(faces)
     if faces.ndim == 2 and faces.shape[1] != 3:
-        faces = fan(faces.tolist())
+        faces = fan(faces.ravel().tolist(), [faces.shape[1]] * len(faces))
     return Polygons(np.asarray(loaded["vertices"]), faces)
 
 
@@ -218,7 +237,7 @@ def _scene(loaded: dict[str, Any]) -> Polygons:
     """The parts of a scene, each instance with its transform, in the order of the scene's nodes."""
     geometry = loaded["geometry"]
     nodes = {node["frame_to"]: node for node in loaded["graph"]}
-    placed = [node for node in loaded["graph"] if node.get("geometry") in geometry and "faces" in geometry[node["geometry"]]]
+    placed = [node for node in loaded["graph"] if "faces" in geometry.get(node.get("geometry"), {})]
     parts = []
     for node in placed:
         matrix, parent, depth = np.asarray(node["matrix"]), node["frame_from"], 0

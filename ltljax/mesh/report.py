@@ -113,3 +113,9 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The area of each face, (F,)."""
     first, second, third = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
+
+
+def face_edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The lengths of the edges of each face, (F, 3), from corner 0 to 1, 1 to 2 and 2 to 0."""
+    corners = vertices[faces]
+    return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

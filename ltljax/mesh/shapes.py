@@ -1,7 +1,7 @@
 """Built-in shapes: surfaces whose geometry is known by formula.
 
-What enters: sizes and counts. What leaves: a checked `Mesh`, oriented outwards (upwards where plane), with the exact unit
-normals of the smooth surface. Irregular meshes are made in `irregular` and are available here too.
+What enters: sizes and counts. What leaves: a checked `Mesh`, oriented outwards (upwards where plane), with the exact
+unit normals of the smooth surface. Irregular meshes are made in `irregular` and are available here too.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 
-def icosphere(subdivisions: int = 4, radius: float = 1.0) -> Mesh:
+def icosphere(subdivisions: int = 4, radius: float | int = 1.0) -> Mesh:
     """A sphere about the origin: the icosahedron, its edges halved ``subdivisions`` times, pushed onto the sphere.
 
     It has 10 * 4^n + 2 vertices: 162, 642, 2562, 10242 for n = 2 to 5.
@@ -39,7 +39,7 @@ def icosphere(subdivisions: int = 4, radius: float = 1.0) -> Mesh:
     return Mesh(positive("radius", radius) * directions, faces, normals=directions)
 
 
-def ellipsoid(axes: tuple[float, float, float] = (1.0, 1.0, 1.0), subdivisions: int = 4) -> Mesh:
+def ellipsoid(axes: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), subdivisions: int = 4) -> Mesh:
     """An ellipsoid about the origin, x^2/a^2 + y^2/b^2 + z^2/c^2 = 1: the icosphere, stretched.
 
     Args:
@@ -47,7 +47,7 @@ def ellipsoid(axes: tuple[float, float, float] = (1.0, 1.0, 1.0), subdivisions: 
         subdivisions: of the icosphere, 0 to 10.
     """
     if np.shape(axes) != (3,):
-        raise ValueError(f"axes must be three half axes, found the shape {np.shape(axes)}. Use e.g. axes=(1.0, 1.0, 0.5).")
+        raise ValueError(f"axes must be three half axes such as (1.0, 1.0, 0.5), found the shape {np.shape(axes)}.")
     half_axes = np.array([positive("each of the axes", axis) for axis in axes])
     directions, faces = icosahedral_lattice(subdivisions)
     gradients = directions / half_axes  # of the left side above, up to a factor
@@ -55,7 +55,7 @@ def ellipsoid(axes: tuple[float, float, float] = (1.0, 1.0, 1.0), subdivisions: 
     return Mesh(half_axes * directions, faces, normals=normals)
 
 
-def torus(major: float = 2.0, minor: float = 1.0, n_major: int = 96, n_minor: int = 48) -> Mesh:
+def torus(major: float | int = 2.0, minor: float | int = 1.0, n_major: int = 96, n_minor: int = 48) -> Mesh:
     """A torus about the z axis: ((a + r cos x) cos y, (a + r cos x) sin y, r sin x).
 
     Vertex ``i * n_minor + j`` is at y = 2 pi i / n_major, x = 2 pi j / n_minor. All quads are cut along the same
@@ -74,7 +74,7 @@ def torus(major: float = 2.0, minor: float = 1.0, n_major: int = 96, n_minor: in
     return Mesh(vertices, grid_faces(n_major, n_minor, wrap_rows=True, wrap_columns=True), normals=normals)
 
 
-def disk(radius: float = 1.0, rings: int = 16) -> Mesh:
+def disk(radius: float | int = 1.0, rings: int = 16) -> Mesh:
     """A plane disk about the origin in z = 0, facing up: ring j has 6 j evenly spaced vertices.
 
     It has 1 + 3 rings (rings + 1) vertices; those of the last ring lie on the circle.
@@ -90,7 +90,7 @@ def disk(radius: float = 1.0, rings: int = 16) -> Mesh:
     return Mesh(vertices, faces, normals=np.tile([0.0, 0.0, 1.0], (len(vertices), 1)))
 
 
-def hemisphere(radius: float = 1.0, rings: int = 16) -> Mesh:
+def hemisphere(radius: float | int = 1.0, rings: int = 16) -> Mesh:
     """The upper half of a sphere about the origin; the boundary is the equator, exactly in z = 0.
 
     Args:
@@ -104,7 +104,7 @@ def hemisphere(radius: float = 1.0, rings: int = 16) -> Mesh:
     return Mesh(positive("radius", radius) * directions, faces, normals=directions)
 
 
-def square(side: float = 1.0, n: int = 32) -> Mesh:
+def square(side: float | int = 1.0, n: int = 32) -> Mesh:
     """The plane square [0, side]^2 in z = 0, facing up, of n by n cells cut along the same diagonal.
 
     Vertex ``i * (n + 1) + j`` is at (side j / n, side i / n, 0).
@@ -122,7 +122,7 @@ def square(side: float = 1.0, n: int = 32) -> Mesh:
     return Mesh(vertices, faces, normals=np.tile([0.0, 0.0, 1.0], (len(vertices), 1)))
 
 
-def cylinder(radius: float = 1.0, height: float = 2.0, n_around: int = 64, n_along: int = 20) -> Mesh:
+def cylinder(radius: float | int = 1.0, height: float | int = 2.0, n_around: int = 64, n_along: int = 20) -> Mesh:
     """The side of a cylinder about the z axis, -height / 2 <= z <= height / 2, open at both ends.
 
     Vertex ``i * (n_along + 1) + j`` is at the angle 2 pi i / n_around and the height -height / 2 + j height / n_along.

@@ -44,8 +44,17 @@ def half_edges(faces: np.ndarray) -> np.ndarray:
 def unique_edges(faces: np.ndarray) -> np.ndarray:
     """The undirected edges (E, 2), int32, lower vertex first, sorted."""
     num_vertices = int(faces.max(initial=-1)) + 1
-    keys = np.unique(undirected_keys(half_edges(faces), num_vertices))
+    # Sorting by hand: since NumPy 2.3 np.unique hashes integers, at five times the cost.
+    keys = np.sort(undirected_keys(half_edges(faces), num_vertices))
+    keys = keys[np.diff(keys, prepend=-1) > 0]
     return np.stack([keys // max(num_vertices, 1), keys % max(num_vertices, 1)], axis=1).astype(np.int32)
+
+
+def used_vertices(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """The vertices that some face refers to, sorted."""
+    is_used = np.zeros(num_vertices, bool)
+    is_used[faces] = True
+    return np.flatnonzero(is_used)
 
 
 def undirected_keys(edges: np.ndarray, num_vertices: int) -> np.ndarray:
@@ -53,12 +62,32 @@ def undirected_keys(edges: np.ndarray, num_vertices: int) -> np.ndarray:
     return edges.min(axis=1).astype(np.int64) * num_vertices + edges.max(axis=1)
 
 
+def shared_edges(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pairs of `half_edges` that share an edge, (N,) each, and whether both run the same way, (N,) bool.
+
+    They run opposite ways where the two faces agree in orientation.
+    """
+    directed = half_edges(faces)
+    keys = undirected_keys(directed, num_vertices)
+    order = np.argsort(keys, kind="stable")
+    pairs = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    one, other = order[pairs], order[pairs + 1]
+    return one, other, directed[one, 0] == directed[other, 0]
+
+
+def components(one: np.ndarray, other: np.ndarray, count: int) -> np.ndarray:
+    """The component label of each of ``count`` nodes that are linked in pairs (N,), (N,)."""
+    graph = sparse.coo_array((np.ones(len(one), np.int8), (one, other)), shape=(count, count))
+    return csgraph.connected_components(graph.tocsr(), directed=False)[1]
+
+
 def boundary_half_edges(faces: np.ndarray, num_vertices: int) -> np.ndarray:
     """The directed edges (B, 2) that belong to one face only, in that face's direction."""
     directed = half_edges(faces)
     keys = undirected_keys(directed, num_vertices)
-    _, where, counts = np.unique(keys, return_index=True, return_counts=True)
-    return directed[np.sort(where[counts == 1])]
+    order = np.argsort(keys)
+    differs = np.diff(keys[order], prepend=-1, append=-1) != 0
+    return directed[order[differs[1:] & differs[:-1]]]
 
 
 def boundary_loops(faces: np.ndarray, num_vertices: int) -> list[np.ndarray]:
@@ -81,9 +110,11 @@ def boundary_loops(faces: np.ndarray, num_vertices: int) -> list[np.ndarray]:
 
 def vertex_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
     """The label (V,), int32, of the connected component of every vertex, numbered by their first vertices."""
-    _, labels = csgraph.connected_components(_adjacency(faces, num_vertices), directed=False)
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse].astype(np.int32)
+    edges = half_edges(faces)
+    labels = components(edges[:, 0], edges[:, 1], num_vertices)
+    first = np.full(labels.max(initial=-1) + 1, num_vertices)
+    np.minimum.at(first, labels, np.arange(num_vertices))
+    return np.argsort(np.argsort(first))[labels].astype(np.int32)
 
 
 def one_rings(faces: np.ndarray, num_vertices: int) -> OneRings:

@@ -47,7 +47,7 @@ class RKC2(diffrax.AbstractAdaptiveSolver):
         """One step with as many stages as its length needs."""
         del made_jump
         rate0, evaluations = solver_state
-        dt = (t1 - t0).astype(y0.dtype)
+        dt = t1 - t0
         table = {name: jnp.asarray(values, y0.dtype) for name, values in _coefficients().items()}
         stiffness = dt * self.spectral_bound(t0, y0, args)
         reach = table["reach"]

@@ -79,7 +79,7 @@ def solve(
     Args:
         equation: what is solved, such as `Diffusion` or `ReactionDiffusion`.
         surface: where.
-        u0: the state at t0, (V,) or (V, S).
+        u0: the state at t0, (V,) or (V, S); taken in the float type of the surface.
         t1: the last time.
         ts: the times at which to keep the state, ascending; by default t1 alone.
         solver: a diffrax solver.
@@ -99,15 +99,14 @@ def solve(
         SolveError: the state overflowed, or the solver failed before t1.
         ValueError: the state does not fit the surface.
     """
-    u0 = jnp.asarray(u0)
+    u0 = jnp.asarray(u0, surface.dtype)
     if u0.ndim not in (1, 2) or u0.shape[0] != surface.num_vertices:
         raise ValueError(
             f"Expected an initial state of shape ({surface.num_vertices},) or ({surface.num_vertices}, S), "
             f"found {u0.shape}."
         )
-    if not jnp.issubdtype(u0.dtype, jnp.floating):
-        u0 = u0.astype(surface.dtype)
-    time = jnp.result_type(float)
+    # Time in the state's own float type: diffrax multiplies the two.
+    time = surface.dtype
     ts = jnp.asarray([t1] if ts is None else ts, time)
     solution = _solve(
         equation, surface, u0, jnp.asarray(t0, time), jnp.asarray(t1, time), ts,
@@ -157,14 +156,14 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
 
     bound = equation.spectral_bound(t0, surface, u0)
     # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
-    dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), (t1 - t0).astype(bound.dtype))
+    dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), t1 - t0)
     keeps_state = isinstance(solver, RKC2)
     out = diffrax.diffeqsolve(
         diffrax.ODETerm(_rate),
         solver,
         t0,
         t1,
-        dt0.astype(t0.dtype),
+        dt0,
         u0,
         (equation, surface),
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], solver_state=keeps_state),
