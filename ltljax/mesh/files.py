@@ -13,7 +13,8 @@ from pathlib import Path
 
 from .errors import MeshError
 from .mesh import Mesh
-from .readers import READERS, Polygons
+from .readers import READERS
+from .text_formats import Polygons
 
 
 def load_mesh(path: str | PathLike[str], *, repair: bool = False, weld: bool = True) -> Mesh:

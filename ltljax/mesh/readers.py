@@ -9,88 +9,54 @@ Other packages are imported where they are used: who computes on a built-in shap
 import io
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 
 from .errors import MeshError
-
-
-class Polygons(NamedTuple):
-    """Vertices (V, 3) in the order of the file, and triangles (F, 3)."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
-def fan(corners: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
-    """Triangles (F, 3) that fan out from the first corner of each polygon.
-
-    Args:
-        corners: the corners of all polygons, one after the other.
-        sizes: the number of corners of each polygon.
-    """
-    flat, counts = np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
-    if np.any(counts < 3):
-        first = int(np.flatnonzero(counts < 3)[0])
-        raise MeshError(f"face {first} has {counts[first]} corners; it needs at least three. Correct or remove it.")
-    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([flat[start], flat[start + step + 1], flat[start + step + 2]], axis=1)
+from .text_formats import Polygons, fan, parse_obj, parse_off, parse_text_ply
 
 
 def read_obj(path: Path) -> Polygons:
-    """Wavefront OBJ: the ``v`` and ``f`` lines.
+    """Wavefront OBJ."""
+    return parse_obj(path.read_bytes())
 
-    trimesh reads OBJ too, but with the eye of a renderer: it splits vertices at texture seams, drops those without a
-    face and regroups by material, so that the order of the file, which per-vertex data follow, is lost.
-    """
-    text = path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    # Flat lists: a million small ones would keep the garbage collector busy for longer than the reading takes.
-    coordinates: list[float] = []
-    corners: list[int] = []
-    sizes: list[int] = []
-    for number, line in enumerate(text.split("\n"), start=1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        try:
-            if words[0] == "v":
-                x, y, z = words[1:4]
-                coordinates += (float(x), float(y), float(z))
-            elif words[0] == "f":
-                # 7/1/3 is vertex 7 with a texture and a normal. Negative numbers count back from the latest vertex.
-                indices = [int(word.partition("/")[0]) for word in words[1:]]
-                latest = len(coordinates) // 3
-                corners += [index - 1 if index >= 0 else latest + index for index in indices]
-                sizes.append(len(indices))
-        except ValueError:
-            raise MeshError(f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it.") from None
-    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(corners, sizes))
+
+def read_off(path: Path) -> Polygons:
+    """OFF."""
+    return parse_off(path.read_bytes())
 
 
 def read_ply(path: Path) -> Polygons:
     """PLY, text or binary."""
     from trimesh.exchange.ply import load_ply
 
-    return _polygons(load_ply(_stream(path), fix_texture=False, skip_materials=True))
+    data = path.read_bytes()
+    if b"format ascii" in data.partition(b"end_header")[0]:
+        return parse_text_ply(data)
+    return _polygons(load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True))
 
 
 def read_stl(path: Path) -> Polygons:
     """STL, text or binary; every triangle brings its own three vertices."""
-    from trimesh.exchange.stl import load_stl
+    from trimesh.exchange.stl import load_stl_ascii, load_stl_binary
 
-    return _polygons(load_stl(_stream(path)))
-
-
-def read_off(path: Path) -> Polygons:
-    """OFF."""
-    from trimesh.exchange.off import load_off
-
-    return _polygons(load_off(_stream(path)))
+    data = path.read_bytes()
+    announced = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
+    # Binary files may begin with "solid" like those in text, so the length decides.
+    if len(data) == 84 + 50 * announced:
+        return _polygons(load_stl_binary(io.BytesIO(data)))
+    if b"facet" in data[:2000].lower():
+        if b"endsolid" not in data[-2000:].lower():
+            raise MeshError("the file ends without 'endsolid': it is truncated. Export or download it again.")
+        return _polygons(load_stl_ascii(io.BytesIO(data)))
+    raise MeshError(
+        f"the file announces {announced} triangles, which take {84 + 50 * announced} bytes, but has {len(data)}. "
+        "It may be truncated: export or download it again."
+    )
 
 
 def read_glb(path: Path) -> Polygons:
@@ -107,9 +73,14 @@ def read_gltf(path: Path) -> Polygons:
     """Text glTF, with its buffers inside or beside it."""
     from trimesh.exchange.gltf import load_gltf
 
-    data = path.read_bytes()
-    _check_gltf(json.loads(data.decode("utf-8")), path)
-    return _scene(load_gltf(io.BytesIO(data), resolver=_resolver(path), skip_materials=True))
+    header = json.loads(path.read_bytes().decode("utf-8"))
+    _check_gltf(header, path)
+    for buffer in header.get("buffers", []):
+        # A file beside it is named as in a web address, with %20 for a space.
+        if not buffer["uri"].startswith("data:"):
+            buffer["uri"] = unquote(buffer["uri"])
+    checked = io.BytesIO(json.dumps(header).encode())
+    return _scene(load_gltf(checked, resolver=_resolver(path), skip_materials=True))
 
 
 def read_meshio(path: Path) -> Polygons:
@@ -169,10 +140,6 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     "vtp": read_vtk,
     "gii": read_gifti,
 }
-
-
-def _stream(path: Path) -> io.BytesIO:
-    return io.BytesIO(path.read_bytes())
 
 
 def _resolver(path: Path) -> Any:

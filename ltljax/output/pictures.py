@@ -1,14 +1,16 @@
 """Pictures and animations of a field on a surface, rendered off-screen by PyVista (the extra `viz`)."""
 
 import importlib.util
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-# From the front, a little from the right and from above; y is up, as in most mesh files.
-_VIEW = (0.55, 0.35, 1.0)
-_SIZE = (960, 720)
+# Both sides, a little from the right and from above; y is up, as in most mesh files.
+_VIEWS = ((0.55, 0.35, 1.0), (-0.55, 0.35, -1.0))
+_SIZE = (1280, 640)
 _FRAMES_PER_SECOND = 20
 
 
@@ -36,25 +38,34 @@ class Picture:
         self._surface = pyvista.PolyData.from_regular_faces(vertices, faces)
         self._surface[title] = np.full(len(vertices), limits[0])
         self._title = title
-        self._plotter = pyvista.Plotter(off_screen=True, window_size=list(_SIZE))
-        self._plotter.set_background("white")
-        self._plotter.add_mesh(
-            self._surface,
-            scalars=title,
-            clim=limits,
-            cmap=colormap,
-            smooth_shading=False,
-            interpolate_before_map=True,
-            specular=0.15,
-            scalar_bar_args=dict(title=title, color="black", vertical=True, position_x=0.9, position_y=0.25, height=0.5),
-        )
-        self._text = None
-        self._plotter.view_vector(_VIEW, viewup=(0, 1, 0))
-        self._plotter.camera.zoom(1.2)
+        # Without a display VTK says so before it renders off-screen all the same.
+        with pyvista.vtk_verbosity("error"):
+            self._plotter = pyvista.Plotter(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
+            for column, view in enumerate(_VIEWS):
+                self._plotter.subplot(0, column)
+                self._plotter.set_background("white")
+                self._plotter.add_mesh(
+                    self._surface,
+                    scalars=title,
+                    clim=limits,
+                    cmap=colormap,
+                    smooth_shading=True,
+                    interpolate_before_map=True,
+                    ambient=0.25,
+                    show_scalar_bar=column == 1,
+                    scalar_bar_args=dict(
+                        title=title, color="black", vertical=True, position_x=0.88, position_y=0.2, height=0.6
+                    ),
+                )
+                self._plotter.view_vector(view, viewup=(0, 1, 0))
+                self._plotter.camera.zoom(1.25)
+            self._plotter.show(auto_close=False)
+        self._plotter.subplot(0, 0)
+        self._text: Any = None
 
     def draw(self, values: np.ndarray, caption: str = "") -> np.ndarray:
         """The picture (height, width, 3) of unsigned bytes of the field's values (V,)."""
-        self._surface[self._title] = values
+        self._surface[self._title][:] = values
         if self._text is not None:
             self._plotter.remove_actor(self._text)
         self._text = self._plotter.add_text(caption, position="lower_left", font_size=11, color="black")
@@ -77,9 +88,13 @@ def write_animation(path: Path, images: Iterable[np.ndarray]) -> Path:
     import imageio.v2
 
     frames = list(images)
-    try:
-        imageio.v2.mimwrite(path, frames, fps=_FRAMES_PER_SECOND, quality=8)  # pyright: ignore[reportArgumentType]
-    except (ValueError, ImportError, OSError, RuntimeError):
-        path = path.with_suffix(".gif")
-        imageio.v2.mimwrite(path, frames, duration=1000 / _FRAMES_PER_SECOND, loop=0)  # pyright: ignore[reportArgumentType]
+    with warnings.catch_warnings():
+        # The encoder is a program of its own, started by fork and exec; JAX warns of forks that go on in Python.
+        warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
+        try:
+            imageio.v2.mimwrite(path, frames, fps=_FRAMES_PER_SECOND, quality=8)  # pyright: ignore[reportArgumentType]
+        except (ValueError, ImportError, OSError, RuntimeError):
+            path = path.with_suffix(".gif")
+            seconds = 1000 / _FRAMES_PER_SECOND
+            imageio.v2.mimwrite(path, frames, duration=seconds, loop=0)  # pyright: ignore[reportArgumentType]
     return path

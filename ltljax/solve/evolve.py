@@ -52,6 +52,20 @@ class Solution(eqx.Module):
     result: diffrax.RESULTS
     overflowed: Array
 
+    def check(self, surface: Surface) -> None:
+        """Raise `SolveError`, with causes and cures, where the run did not reach its end."""
+        time = float(self.t_end)
+        if bool(self.overflowed):
+            raise SolveError(f"The state overflowed at t = {time:.4g}. {_cause_of_overflow(surface)}", time, self)
+        if self.result != diffrax.RESULTS.successful and self.result != diffrax.RESULTS.event_occurred:
+            raise SolveError(
+                f"The run stopped at t = {time:.4g}: {diffrax.RESULTS[self.result]} Causes are (a) a state about to "
+                "overflow, which forces ever smaller steps, (b) max_steps too small for the stiffness of the mesh, or "
+                "(c) tolerances beyond the float type. Raise max_steps or rtol, use float64, or check the reaction.",
+                time,
+                self,
+            )
+
 
 def solve(
     equation: Equation,
@@ -115,7 +129,7 @@ def solve(
         _meter(progress), rtol, atol, max_steps,
     )  # fmt: skip
     if throw and not isinstance(solution.t_end, jax.core.Tracer):
-        _raise_on_failure(solution, surface)
+        solution.check(surface)
     return solution
 
 
@@ -181,22 +195,11 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
     return Solution(ts, us, t_end[0], u_end[0], stats, out.result, out.event_mask)
 
 
-def _raise_on_failure(solution: Solution, surface: Surface) -> None:
-    time = float(solution.t_end)
-    if bool(solution.overflowed):
-        cause = (
-            "The published operator (scheme paper) has growing modes on such meshes: use ltl.Monotone()."
-            if isinstance(surface.scheme, Paper)
-            else "Diffusion cannot grow with this scheme, so the cause is (a) a reaction or source that grows without "
-            "bound, or (b) an initial state that is not finite or far from where the reaction makes sense. Check the "
-            "rates and the initial state."
-        )
-        raise SolveError(f"The state overflowed at t = {time:.4g}. {cause}", time, solution)
-    if solution.result != diffrax.RESULTS.successful:
-        raise SolveError(
-            f"The run stopped at t = {time:.4g}: {diffrax.RESULTS[solution.result]} Causes are (a) a state about to "
-            "overflow, which forces ever smaller steps, (b) max_steps too small for the stiffness of the mesh, or (c) "
-            "tolerances beyond the float type. Raise max_steps or rtol, use float64, or check the reaction.",
-            time,
-            solution,
-        )
+def _cause_of_overflow(surface: Surface) -> str:
+    if isinstance(surface.scheme, Paper):
+        return "The published operator (scheme paper) has growing modes on such meshes: use ltl.Monotone()."
+    return (
+        "Diffusion cannot grow with this scheme, so the cause is (a) a reaction or source that grows without bound, or "
+        "(b) an initial state that is not finite or far from where the reaction makes sense. Check the rates and the "
+        "initial state."
+    )

@@ -1,0 +1,140 @@
+"""The formats that are lines of text: OBJ, OFF and the text form of PLY.
+
+What enters: the bytes of a file. What leaves: `Polygons`, unchecked.
+
+trimesh reads these too, but with the eye of a renderer. It splits the vertices of an OBJ at texture seams, drops those
+without a face and regroups by material, so that the order of the file, which per-vertex data follow, is lost; and it
+takes an OFF or a PLY that ends too early for a complete one.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .errors import MeshError
+
+
+class Polygons(NamedTuple):
+    """Vertices (V, 3) in the order of the file, and triangles (F, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def fan(corners: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+    """Triangles (F, 3) that fan out from the first corner of each polygon.
+
+    Args:
+        corners: the corners of all polygons, one after the other.
+        sizes: the number of corners of each polygon.
+    """
+    flat, counts = np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
+    if np.any(counts < 3):
+        first = int(np.flatnonzero(counts < 3)[0])
+        raise MeshError(f"face {first} has {counts[first]} corners; it needs at least three. Correct or remove it.")
+    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    return np.stack([flat[start], flat[start + step + 1], flat[start + step + 2]], axis=1)
+
+
+def parse_obj(data: bytes) -> Polygons:
+    """Wavefront OBJ: the ``v`` and ``f`` lines."""
+    text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    # Flat lists: a million small ones would keep the garbage collector busy for longer than the reading takes.
+    coordinates: list[float] = []
+    corners: list[int] = []
+    sizes: list[int] = []
+    for number, line in enumerate(text.split("\n"), start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        try:
+            if words[0] == "v":
+                x, y, z = words[1:4]
+                coordinates += (float(x), float(y), float(z))
+            elif words[0] == "f":
+                # 7/1/3 is vertex 7 with a texture and a normal. Negative numbers count back from the latest vertex.
+                indices = [int(word.partition("/")[0]) for word in words[1:]]
+                latest = len(coordinates) // 3
+                corners += [index - 1 if index >= 0 else latest + index for index in indices]
+                sizes.append(len(indices))
+        except ValueError:
+            raise MeshError(f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it.") from None
+    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(corners, sizes))
+
+
+def parse_off(data: bytes) -> Polygons:
+    """OFF: a head, the counts, a line for each vertex and each face; comments begin with #."""
+    text = data.decode("utf-8", errors="replace")
+    rows = [words for line in text.splitlines() if (words := line.partition("#")[0].split())]
+    head = rows[0].pop(0) if rows else ""
+    # A head such as CNOFF announces colours and normals, which follow the three coordinates.
+    if head not in ("OFF", "COFF", "NOFF", "CNOFF", "STOFF"):
+        raise MeshError(f"expected the head OFF, found {head[:20]!r}. Check that the file is in the OFF format.")
+    rows = [row for row in rows if row]
+    if not rows or len(rows[0]) < 2:
+        raise MeshError("expected the numbers of vertices and faces after the head. Export or download the file again.")
+    num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
+    vertex_rows = _rows(rows, 1, num_vertices, "vertices")
+    face_rows = _rows(rows, 1 + num_vertices, num_faces, "faces")
+    return Polygons(_coordinates(vertex_rows, [0, 1, 2]), _polygon_rows(face_rows, 0))
+
+
+def parse_text_ply(data: bytes) -> Polygons:
+    """PLY in its text form."""
+    head, _, body = data.decode("utf-8", errors="replace").partition("end_header")
+    elements: list[tuple[str, int, list[str], list[str]]] = []  # name, count, names and types of the properties
+    for words in map(str.split, head.splitlines()):
+        if words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), [], []))
+        elif words[:1] == ["property"]:
+            elements[-1][2].append(words[-1])
+            elements[-1][3].append(words[1])
+    rows = [words for line in body.splitlines() if (words := line.split())]
+    vertices, faces, position = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
+    for name, count, names, types in elements:
+        here = _rows(rows, position, count, name)
+        position += count
+        if name == "vertex":
+            if "list" in types:
+                raise MeshError("vertices have a property that is a list. Export the file with plain coordinates.")
+            vertices = _coordinates(here, [names.index(axis) for axis in "xyz"])
+        elif name == "face" and "list" in types:
+            # What comes before the first list is one word each.
+            faces = _polygon_rows(here, types.index("list"))
+    return Polygons(vertices, faces)
+
+
+def _rows(rows: list[list[str]], start: int, count: int, what: str) -> list[list[str]]:
+    """The next ``count`` rows, all of them."""
+    found = rows[start : start + count] if count > 0 else []
+    if len(found) != count:
+        raise MeshError(
+            f"the file announces {count} rows of {what}, but holds {len(found)}. "
+            "It may be truncated: export or download it again."
+        )
+    return found
+
+
+def _coordinates(rows: list[list[str]], columns: list[int]) -> np.ndarray:
+    """The positions (V, 3) in three columns of the rows."""
+    if any(len(row) <= max(columns) for row in rows):
+        first = next(index for index, row in enumerate(rows) if len(row) <= max(columns))
+        raise MeshError(f"vertex {first} has fewer than three coordinates. Export or download the file again.")
+    x, y, z = columns
+    return np.array([(float(row[x]), float(row[y]), float(row[z])) for row in rows]).reshape(-1, 3)
+
+
+def _polygon_rows(rows: list[list[str]], lead: int) -> np.ndarray:
+    """The triangles of rows that hold, after ``lead`` other words, the number of corners and the corners."""
+    corners: list[int] = []
+    sizes: list[int] = []
+    for index, row in enumerate(rows):
+        size = int(row[lead]) if len(row) > lead else 0
+        found = row[lead + 1 : lead + 1 + size]
+        if len(found) != size:
+            raise MeshError(f"face {index} announces {size} corners, but has {len(found)}. Download the file again.")
+        corners += map(int, found)
+        sizes.append(size)
+    return fan(corners, sizes)

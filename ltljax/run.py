@@ -1,0 +1,249 @@
+"""A scenario becomes results: time stepping with a progress bar, what was measured, and files.
+
+What enters: a `Scenario` and how to run it. What leaves: a folder with pictures, data and ``summary.json``.
+"""
+
+import dataclasses
+import json
+import platform
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .lifting.schemes import Monotone, Paper
+from .mesh import Mesh
+from .operators import integrate
+from .scenario import Options, Scenario
+from .solve import SolveError, solve
+from .surface import Surface
+
+_SCHEMES = {"monotone": Monotone(), "paper": Paper()}
+_PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
+_TOLERANCES = dict(rtol=1e-4, atol=1e-6)
+
+
+@dataclasses.dataclass
+class _Progress:
+    """What a run has reached."""
+
+    times: list[float]
+    states: list[np.ndarray]
+    compile_seconds: float = 0.0
+    step_seconds: float = 0.0
+    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+
+
+def run(example: Scenario, options: Options, *, scheme: str, dtype: str, frames: int, out: Path) -> dict[str, Any]:
+    """Solve a scenario and write its results.
+
+    Args:
+        example: the scenario.
+        options: what it was made from, for the record.
+        scheme: ``"monotone"`` or ``"paper"``.
+        dtype: ``"float32"`` or ``"float64"``.
+        frames: how many states to keep, evenly spaced in time, besides the first.
+        out: the folder to write to; made if absent.
+
+    Returns:
+        What ``summary.json`` holds.
+
+    Raises:
+        SolveError: the run could not be carried to its end. What it had reached is written all the same.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    mesh = example.mesh
+    start = time.perf_counter()
+    surface = Surface.from_mesh(mesh, _SCHEMES[scheme], dtype)
+    build_seconds = time.perf_counter() - start
+    print(f"{example.name} on {options.mesh}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, scheme {scheme}")
+    for note in example.notes:
+        print(f"note: {note}")
+    if surface.report.inconsistent is not None and len(surface.report.inconsistent):
+        print(
+            f"note: {len(surface.report.inconsistent)} vertices have no consistent non-negative row; diffusion is "
+            "stable there, but not accurate."
+        )
+
+    reached = _Progress([0.0], [example.u0])
+    failure = None
+    try:
+        _advance(example, surface, np.linspace(0, example.t1, frames + 1), reached)
+    except SolveError as error:
+        failure = error
+    measured = _measure(example, surface, reached)
+    measured["build_seconds"] = build_seconds
+    for name, value in measured.items():
+        print(f"{name.replace('_', ' '):32} {_readable(value)}")
+
+    files = _write(example, out, reached)
+    summary = dict(
+        scenario=example.name,
+        options=dataclasses.asdict(options),
+        parameters=example.parameters,
+        scheme=repr(surface.scheme),
+        dtype=dtype,
+        frames=frames,
+        t1=example.t1,
+        tolerances=_TOLERANCES,
+        notes=example.notes,
+        failure=None if failure is None else str(failure),
+        measured=measured,
+        mesh=mesh.report.as_dict(),
+        surface=str(surface.report).splitlines(),
+        files=files,
+        versions=_versions(),
+        device=str(jax.devices()[0]),
+    )
+    (out / "summary.json").write_text(json.dumps(summary, indent=2, default=_as_json) + "\n")
+    print(f"{'written to':32} {out}: {', '.join([*files, 'summary.json'])}")
+    if failure is not None:
+        raise failure
+    return summary
+
+
+def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _Progress) -> None:
+    """Carry the state from each time to the next, so that it can be shown, kept, and stopped in between."""
+    equation = example.make_equation(surface.dtype)
+    u = jnp.asarray(example.u0, surface.dtype)
+    start = time.perf_counter()
+    # From a time to itself: nothing to step, everything to compile.
+    jax.block_until_ready(solve(equation, surface, u, times[0], t0=times[0], throw=False, **_TOLERANCES).us)
+    reached.compile_seconds = time.perf_counter() - start
+    for t0, t1 in _with_progress(list(zip(times[:-1], times[1:], strict=True))):
+        start = time.perf_counter()
+        solution = solve(equation, surface, u, t1, t0=t0, throw=False, **_TOLERANCES)
+        u = jax.block_until_ready(solution.u_end)
+        reached.step_seconds += time.perf_counter() - start
+        for name, count in solution.stats.items():
+            reached.counts[name] = reached.counts.get(name, 0) + int(count)
+        reached.times.append(float(solution.t_end))
+        reached.states.append(np.asarray(u))
+        solution.check(surface)
+
+
+def _with_progress(steps: list[tuple[float, float]]) -> Iterator[tuple[float, float]]:
+    try:
+        from tqdm import tqdm  # in the extra `app`
+    except ImportError:
+        yield from _with_plain_progress(steps)
+        return
+    yield from tqdm(steps, desc="time", unit="frame", dynamic_ncols=True)
+
+
+def _with_plain_progress(steps: list[tuple[float, float]]) -> Iterator[tuple[float, float]]:
+    start = time.perf_counter()
+    for done, step in enumerate(steps):
+        if done and done % max(1, len(steps) // 10) == 0:
+            left = (time.perf_counter() - start) / done * (len(steps) - done)
+            print(f"t = {step[0]:.4g} ({100 * done // len(steps)} %), about {left:.0f} s left", file=sys.stderr)
+        yield step
+
+
+def _measure(example: Scenario, surface: Surface, reached: _Progress) -> dict[str, Any]:
+    first, last, t_end = reached.states[0], reached.states[-1], reached.times[-1]
+    columns = last.reshape(len(last), -1)
+    measured: dict[str, Any] = {"reached_time": t_end}
+    if example.exact is not None:
+        error = np.abs(last - example.exact(t_end))
+        scale = np.abs(example.exact(t_end))
+        measured["exact_solution"] = example.exact_is
+        measured["relative_error_L2"] = float(np.sqrt((error**2).sum() / (scale**2).sum()))
+        measured["relative_error_max"] = float(error.max() / scale.max())
+    for name, values in zip(example.species, columns.T, strict=True):
+        measured[f"range_of_{name}"] = (float(values.min()), float(values.max()))
+    if len(example.species) > 1:
+        name = example.species[example.shown]
+        measured[f"maxima_of_{name}"] = count_maxima(example.mesh, columns[:, example.shown])
+    for name, state in (("start", first), ("end", last)):
+        mass = integrate(surface, jnp.asarray(state, surface.dtype))
+        measured[f"mass_at_{name}"] = np.atleast_1d(np.asarray(mass)).tolist()
+    counts = reached.counts
+    measured["steps"] = counts.get("num_steps", 0)
+    if "num_evaluations" in counts:
+        measured["evaluations_of_the_rate"] = counts["num_evaluations"]
+    measured["compile_seconds"] = reached.compile_seconds
+    measured["step_seconds"] = reached.step_seconds
+    measured["vertex_steps_per_second"] = counts.get("num_steps", 0) * len(last) / max(reached.step_seconds, 1e-9)
+    return measured
+
+
+def count_maxima(mesh: Mesh, values: np.ndarray) -> int:
+    """The number of vertices above the mean whose value no neighbour reaches: spots of a pattern.
+
+    A field that varies by less than a thousandth of its size is uniform and has none.
+    """
+    if not np.ptp(values) > 1e-3 * np.abs(values).max():
+        return 0
+    i, j = mesh.edges.T
+    highest = np.full(len(values), -np.inf)
+    np.maximum.at(highest, i, values[j])
+    np.maximum.at(highest, j, values[i])
+    return int(np.sum((values > highest) & (values > values.mean())))
+
+
+def _write(example: Scenario, out: Path, reached: _Progress) -> list[str]:
+    from .output import colors, files, pictures
+
+    vertices, faces = example.mesh.vertices, example.mesh.faces
+    name, times = example.name, np.array(reached.times)
+    fields = [dict(zip(example.species, u.reshape(len(u), -1).T, strict=True)) for u in reached.states]
+    shown = example.species[example.shown]
+    series = out / "series"
+    series.mkdir(exist_ok=True)
+    for stale in series.glob(f"{name}_*.vtp"):
+        stale.unlink()
+    frames = [f"series/{name}_{index:04d}.vtp" for index in range(len(times))]
+    for frame, state in zip(frames, fields, strict=True):
+        files.write_vtp(out / frame, vertices, faces, state)
+    files.write_series(out / f"{name}.pvd", times, frames)
+
+    limits = _limits([state[shown] for state in fields])
+    files.write_ply(out / f"{name}.ply", vertices, faces, colors.vertex_colors(fields[-1][shown], limits))
+    written = [f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply"]
+    if not pictures.can_draw():
+        print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
+        return written
+    picture = pictures.Picture(vertices, faces, shown, limits)
+    captions = [f"{name}   t = {t:.3g}" for t in times]
+    images = [picture.draw(state[shown], text) for state, text in zip(fields, captions, strict=True)]
+    picture.close()
+    pictures.write_png(out / f"{name}.png", images[-1])
+    animation = pictures.write_animation(out / f"{name}.mp4", images)
+    return [*written, f"{name}.png", animation.name]
+
+
+def _limits(states: Iterable[np.ndarray]) -> tuple[float, float]:
+    """The range of the last state that is finite, a little of it even where that is uniform."""
+    last = [values for values in states if np.isfinite(values).all()][-1]
+    low, high = float(last.min()), float(last.max())
+    margin = 1e-3 * max(abs(low), abs(high), 1e-12)
+    return (low, high) if high - low > margin else (low - margin, high + margin)
+
+
+def _versions() -> dict[str, str | None]:
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = None
+    return versions
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, tuple | list):
+        return " .. ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else ", ".join(f"{v:.6g}" for v in value)
+    return str(value)
