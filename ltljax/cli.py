@@ -48,14 +48,18 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument("scenario", choices=scenario.SCENARIOS, help="what to solve (see: ltljax list)")
     run_.add_argument("--mesh", default="sphere", help="sphere, torus, or a mesh file (default: sphere)")
     run_.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
-    run_.add_argument("--source", choices=scenario.SOURCES, help="heat on the torus: the source (default: angle-zero-mean)")
+    run_.add_argument(
+        "--source", choices=scenario.SOURCES, help="heat on the torus: the source (default: angle-zero-mean)"
+    )
     run_.add_argument("--as-published", action="store_true", help="turing: the paper's parameters, which stay uniform")
     run_.add_argument("--scheme", choices=("monotone", "paper"), default="monotone", help="default: monotone")
     run_.add_argument("--t1", type=_positive, help="end of the run (default: the scenario's)")
     run_.add_argument("--frames", type=_count, default=60, help="states kept, evenly spaced in time (default: 60)")
     run_.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default: 0)")
     run_.add_argument("--dtype", choices=("float32", "float64"), default="float64", help="default: float64")
-    run_.add_argument("--keep-scale", action="store_true", help="mesh files: do not scale the area to the unit sphere's")
+    run_.add_argument(
+        "--keep-scale", action="store_true", help="mesh files: do not scale the area to the unit sphere's"
+    )
     run_.add_argument("--repair", action="store_true", help="mesh files: mend what can be mended")
 
     listing = commands.add_parser("list", help="the scenarios and built-in meshes")
@@ -94,7 +98,9 @@ def _list(options: argparse.Namespace) -> int:
     del options
     for name, make in scenario.SCENARIOS.items():
         print(f"{name:8} {(make.__doc__ or '').splitlines()[0]}")
-    print(f"\nmeshes: {', '.join(scenario.BUILT_IN)}, or any mesh file. Start one with: ltljax run turing --mesh sphere")
+    print(
+        f"\nmeshes: {', '.join(scenario.BUILT_IN)}, or any mesh file. Start one with: ltljax run turing --mesh sphere"
+    )
     return 0
 
 

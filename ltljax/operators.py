@@ -15,11 +15,11 @@ import scipy.sparse
 from jaxtyping import Array, Float
 
 from .surface import Surface
-from .tables import coordinates, difference_sum, slot_sum
+from .tables import AnyArray, coordinates, difference_sum, slot_sum
 
 
 @eqx.filter_jit
-def gradient(surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S 3"]:
+def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3"]:
     """The surface gradient of u, tangent, in ambient coordinates.
 
     ``Monotone``: the quadratic fit on the lifted ring, second order. ``Paper``: the mean of affine gradients over the
@@ -39,7 +39,7 @@ def gradient(surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S 3"
 
 
 @eqx.filter_jit
-def divergence(surface: Surface, X: Float[Array, "V *S 3"]) -> Float[Array, "V *S"]:
+def divergence(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S"]:
     """The surface divergence of a tangent vector field, positive where the field spreads out.
 
     The neighbours' vectors are transported into the vertex's tangent plane and differentiated there with the weights
@@ -62,7 +62,7 @@ def divergence(surface: Surface, X: Float[Array, "V *S 3"]) -> Float[Array, "V *
 
 
 @eqx.filter_jit
-def laplacian(surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
+def laplacian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
     """The Laplace-Beltrami operator, Delta u = div grad u: on the unit sphere ``laplacian(x1) = -2 x1``.
 
     ``Monotone``: one sum over non-negative weights; pointwise first order on irregular meshes and second on symmetric
@@ -80,13 +80,14 @@ def laplacian(surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]
     equation behind ``Monotone``.
     """
     _check_rows(surface, u, "u")
-    if surface.topology.diffusion is None:
+    table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
+    if table is None or weights is None:
         return _divergence_in_frame(surface, *_gradient_in_frame(surface, u))
-    return difference_sum(surface.topology.diffusion, surface.geometry.laplacian_weights, u)
+    return difference_sum(table, weights, u)
 
 
 @eqx.filter_jit
-def integrate(surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "*S"]:
+def integrate(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "*S"]:
     """The integral of u over the surface, with the vertex areas as quadrature: second order.
 
     Args:
@@ -122,7 +123,7 @@ def spectral_bound(surface: Surface) -> Float[Array, ""]:
     between its negative and zero. For ``Paper`` it bounds the product of divergence and gradient.
     """
     geometry, topology = surface.geometry, surface.topology
-    if topology.diffusion is not None:
+    if topology.diffusion is not None and geometry.laplacian_weights is not None:
         return 2 * jnp.max(slot_sum(topology.diffusion, geometry.laplacian_weights))
     size = functools.partial(jax.tree.map, jnp.abs)
     steep = sum(slot_sum(topology.jet, size(weights)) for weights in geometry.gradient_weights)
@@ -148,7 +149,7 @@ def _to_ambient(surface: Surface, x: Array, y: Array) -> Array:
     return jnp.einsum("av...,vac->v...c", jnp.stack([x, y]), surface.geometry.frames)
 
 
-def _check_rows(surface: Surface, field: Array, name: str) -> None:
+def _check_rows(surface: Surface, field: AnyArray, name: str) -> None:
     if field.ndim == 0 or field.shape[0] != surface.num_vertices:
         raise ValueError(
             f"Expected {name} with one row per vertex, ({surface.num_vertices}, ...), found shape {field.shape}."

@@ -4,6 +4,7 @@ What enters: a `Scenario` and how to run it. What leaves: a folder with pictures
 """
 
 import dataclasses
+import itertools
 import json
 import platform
 import sys
@@ -26,7 +27,7 @@ from .surface import Surface
 
 _SCHEMES = {"monotone": Monotone(), "paper": Paper()}
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
-_TOLERANCES = dict(rtol=1e-4, atol=1e-6)
+_RTOL, _ATOL = 1e-4, 1e-6
 
 
 @dataclasses.dataclass
@@ -91,7 +92,7 @@ def run(example: Scenario, options: Options, *, scheme: str, dtype: str, frames:
         dtype=dtype,
         frames=frames,
         t1=example.t1,
-        tolerances=_TOLERANCES,
+        tolerances=dict(rtol=_RTOL, atol=_ATOL),
         notes=example.notes,
         failure=None if failure is None else str(failure),
         measured=measured,
@@ -114,11 +115,11 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
     u = jnp.asarray(example.u0, surface.dtype)
     start = time.perf_counter()
     # From a time to itself: nothing to step, everything to compile.
-    jax.block_until_ready(solve(equation, surface, u, times[0], t0=times[0], throw=False, **_TOLERANCES).us)
+    jax.block_until_ready(solve(equation, surface, u, 0.0, t0=0.0, throw=False, rtol=_RTOL, atol=_ATOL).us)
     reached.compile_seconds = time.perf_counter() - start
-    for t0, t1 in _with_progress(list(zip(times[:-1], times[1:], strict=True))):
+    for t0, t1 in _with_progress(list(itertools.pairwise(times.tolist()))):
         start = time.perf_counter()
-        solution = solve(equation, surface, u, t1, t0=t0, throw=False, **_TOLERANCES)
+        solution = solve(equation, surface, u, t1, t0=t0, throw=False, rtol=_RTOL, atol=_ATOL)
         u = jax.block_until_ready(solution.u_end)
         reached.step_seconds += time.perf_counter() - start
         for name, count in solution.stats.items():
@@ -161,6 +162,7 @@ def _measure(example: Scenario, surface: Surface, reached: _Progress) -> dict[st
     if len(example.species) > 1:
         name = example.species[example.shown]
         measured[f"maxima_of_{name}"] = count_maxima(example.mesh, columns[:, example.shown])
+        measured[f"minima_of_{name}"] = count_maxima(example.mesh, -columns[:, example.shown])
     for name, state in (("start", first), ("end", last)):
         mass = integrate(surface, jnp.asarray(state, surface.dtype))
         measured[f"mass_at_{name}"] = np.atleast_1d(np.asarray(mass)).tolist()
@@ -245,5 +247,7 @@ def _readable(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple | list):
-        return " .. ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else ", ".join(f"{v:.6g}" for v in value)
+        return (
+            " .. ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else ", ".join(f"{v:.6g}" for v in value)
+        )
     return str(value)

@@ -74,7 +74,9 @@ class Scenario:
 
 
 def heat(options: Options) -> Scenario:
-    """u_t = Delta u + g from u = 0 (section 3): g = x1 on the sphere and on files, g of the poloidal angle on the torus."""
+    """u_t = Delta u + g from u = 0 (section 3): g = x1, or on the torus a function of the poloidal angle."""
+    if options.as_published:
+        raise ValueError("--as-published belongs to turing; for heat on the torus see --source angle.")
     if options.mesh == "torus":
         return _heat_on_torus(options)
     if options.source is not None:
@@ -139,7 +141,8 @@ def turing(options: Options) -> Scenario:
             "no diffusivities can, so the state stays uniform and tends to (1, 16).",
         )
     else:
-        reaction = dict(rate=10.0, feed=16.0, decay=12.0)
+        # Turk's decay of 12 gives spots that run together into stripes; at 11 they stay apart.
+        reaction = dict(rate=10.0, feed=16.0, decay=11.0)
         diffusivity, start, noise, t1 = (0.8, 0.1), 4.0, 0.1, 40.0
         note += ("Where v falls below 0.05 its sink fades to zero, which keeps v from turning negative.",)
     rng = np.random.default_rng(options.seed)

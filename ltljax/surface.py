@@ -29,7 +29,7 @@ from .lifting.schemes import (
     weigh,
 )
 from .mesh import Mesh, OneRings, k_ring, one_rings
-from .tables import Table, build_table
+from .tables import AnyArray, Table, build_table
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +58,9 @@ class SurfaceReport:
     def __str__(self):
         lines = [f"gradient rows wider than one ring   {len(self.wide_gradient_rows)}"]
         if self.rings is not None and self.residual is not None and self.inconsistent is not None:
-            lines += [f"Laplacian rows from {n} ring{'s' * (n > 1)}         {np.sum(self.rings == n)}" for n in (1, 2, 3)]
+            lines += [
+                f"Laplacian rows from {n} ring{'s' * (n > 1)}         {np.sum(self.rings == n)}" for n in (1, 2, 3)
+            ]
             lines.append(f"inconsistent Laplacian rows         {len(self.inconsistent)}")
             if len(self.inconsistent):
                 lines.append(f"worst moment residual               {self.residual.max():.2g}")
@@ -96,7 +98,9 @@ class Surface(eqx.Module):
             ValueError: the dtype is no float, or is float64 while JAX has 64-bit numbers switched off.
         """
         if not isinstance(mesh, Mesh):
-            raise TypeError(f"Expected a Mesh, found {type(mesh).__name__}. Use ltl.load_mesh(path) or ltl.Mesh(vertices, faces).")
+            raise TypeError(
+                f"Expected a Mesh, found {type(mesh).__name__}. Use ltl.load_mesh(path) or ltl.Mesh(vertices, faces)."
+            )
         scheme = Monotone() if scheme is None else scheme
         if not isinstance(scheme, Scheme):
             raise TypeError(f"Expected a scheme such as ltl.Monotone() or ltl.Paper(), found {scheme!r}.")
@@ -107,7 +111,7 @@ class Surface(eqx.Module):
         topology = jax.tree.map(jnp.asarray, topology)
         return cls(topology, geometry, scheme, report)
 
-    def with_vertices(self, vertices: Float[Array, "V 3"]) -> "Surface":
+    def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with its vertices moved and every weight computed anew, on the same support.
 
         Pure, differentiable in the vertices and jit-compiled; the host is not asked. The support is the one chosen for
@@ -115,7 +119,7 @@ class Surface(eqx.Module):
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")
-        geometry = _cast(_weigh(self.scheme, vertices, self.topology), self.dtype)
+        geometry = _cast(_weigh(self.scheme, jnp.asarray(vertices), self.topology), self.dtype)
         return eqx.tree_at(lambda surface: surface.geometry, self, geometry)
 
     @property
@@ -159,7 +163,9 @@ def _float_dtype(dtype):
     if dtype not in (jnp.float32, jnp.float64):
         raise ValueError(f"Expected dtype float32 or float64, found {dtype}.")
     if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
-        raise ValueError('dtype float64 needs 64-bit numbers in JAX: call jax.config.update("jax_enable_x64", True) first.')
+        raise ValueError(
+            'dtype float64 needs 64-bit numbers in JAX: call jax.config.update("jax_enable_x64", True) first.'
+        )
     return dtype
 
 

@@ -1,6 +1,7 @@
 """Padded neighbour tables, and the one loop everything runs through: a weighted sum over the slots of a row.
 
-What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and sums over its slots. No geometry.
+What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and sums over its slots. Knows no
+geometry.
 
 Tables are slot-major: ``indices[k, v]`` is the neighbour of vertex v in slot k. An empty slot holds v's own index and
 weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few rows longer than
@@ -9,6 +10,7 @@ whose widths double, so at most half of any tail block is padding.
 """
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,8 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 # Tables are built and weighed on the host in NumPy, and used on the device; code that serves both asks the array for
-# its namespace (`x.__array_namespace__()`, the array API standard).
-AnyArray = Array | np.ndarray
+# its namespace (`x.__array_namespace__()`, the array API standard). A type checker cannot follow which of the two an
+# array is; while the tests run it is checked to be one of them.
+if TYPE_CHECKING:
+    AnyArray = Any
+else:
+    AnyArray = Array | np.ndarray
 
 # Beyond this many slots a loop unrolled over slots only costs compile time.
 _UNROLL = 32

@@ -1,7 +1,7 @@
 """Every format gives the same surface, real meshes give their known counts, and damaged files give a `MeshError`."""
 
 import base64
-import builtins
+import importlib.util
 import json
 import time
 from pathlib import Path
@@ -120,6 +120,31 @@ def test_ply_and_off_with_polygons_and_further_columns(tmp_path):
         mesh = load_mesh(written(tmp_path, name, text))
         assert (mesh.num_vertices, mesh.num_faces) == (16, 18)
         assert mesh.area == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_ply_with_mixed_polygons_and_further_properties(tmp_path, order):
+    square = shapes.square(n=3)
+    quads = [[i * 4 + j, i * 4 + j + 1, i * 4 + j + 5, i * 4 + j + 4] for i in range(3) for j in range(3)]
+    polygons = [[1, 2, 6, 5, 4, 0], *quads[2:8], quads[8][:3], [quads[8][0], *quads[8][2:]]]
+    kind = {"<": "little", ">": "big"}[order]
+    head = f"ply\nformat binary_{kind}_endian 1.0\nobj_info x\nelement camera 2\nproperty list short double pose\n"
+    head += "element vertex 16\nproperty uchar red\nproperty double x\nproperty double y\nproperty double z\n"
+    head += f"element face {len(polygons)}\nproperty list uchar float texcoord\nproperty ushort flag\n"
+    head += "property list uchar uint vertex_indices\nelement edge 1\nproperty int a\nend_header\n"
+    body = b"".join(np.array([2], f"{order}i2").tobytes() + np.array([0.5, 2], f"{order}f8").tobytes() for _ in "ab")
+    body += b"".join(b"\n" + point.astype(f"{order}f8").tobytes() for point in square.vertices)
+    for index, polygon in enumerate(polygons):
+        texture = np.zeros(index % 3, f"{order}f4")
+        body += bytes([len(texture)]) + texture.tobytes() + b"ab" + bytes([len(polygon)])
+        body += np.array(polygon, f"{order}u4").tobytes()
+    data = head.encode() + body + b"1234"
+    mesh = load_mesh(written(tmp_path, "mixed.ply", data))
+    np.testing.assert_array_equal(mesh.vertices, square.vertices)
+    assert (mesh.num_faces, mesh.area) == (18, pytest.approx(1.0))
+    for length in range(len(head) + 20, len(data) - 3, 37):
+        with pytest.raises(MeshError, match="end before them"):
+            load_mesh(written(tmp_path, "cut.ply", data[:length]))
 
 
 def test_a_scene_is_joined_with_its_transforms(tmp_path):
@@ -248,6 +273,21 @@ def test_vtk_surfaces_are_read_through_pyvista(tmp_path):
         np.testing.assert_array_equal(mesh.faces, shape.faces)
 
 
+def test_a_damaged_vtk_surface_does_not_end_the_process(tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    shape = shapes.disk(rings=3)
+    pyvista.PolyData.from_regular_faces(shape.vertices, shape.faces).save(str(tmp_path / "surface.vtk"))
+    data = (tmp_path / "surface.vtk").read_bytes()
+    assert data.count(b"POLYGONS 54 216") + data.count(b"POLYGONS 55 162") == 1
+    worse = data.replace(b"POLYGONS 5", b"POLYGONS 9000005")
+    with pytest.raises(MeshError, match=r"worse\.vtk: "):
+        load_mesh(written(tmp_path, "worse.vtk", worse))
+    pyvista.ImageData(dimensions=(3, 3, 3)).save(str(tmp_path / "image.vti"))
+    (tmp_path / "image.vti").rename(tmp_path / "image.vtp")
+    with pytest.raises(MeshError, match=r"image\.vtp: "):
+        load_mesh(tmp_path / "image.vtp")
+
+
 def test_gifti_surfaces_are_read_through_nibabel(tmp_path):
     nibabel = pytest.importorskip("nibabel")
     shape = shapes.icosphere(1)
@@ -264,14 +304,7 @@ def test_gifti_surfaces_are_read_through_nibabel(tmp_path):
 
 @pytest.mark.parametrize(("name", "extra"), [("m.vtu", "io"), ("m.msh", "io"), ("m.gii", "io"), ("m.vtp", "viz")])
 def test_a_missing_reader_names_the_extra(tmp_path, monkeypatch, name, extra):
-    real = builtins.__import__
-
-    def without(module, *args, **kwargs):
-        if module in ("meshio", "nibabel", "pyvista"):
-            raise ImportError(module)
-        return real(module, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
     with pytest.raises(MeshError) as caught:
         load_mesh(written(tmp_path, name, "x"))
     assert f'pip install "ltljax[{extra}]"' in str(caught.value)
@@ -304,7 +337,7 @@ def test_a_missing_reader_names_the_extra(tmp_path, monkeypatch, name, extra):
             "claims2.ply",
             "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\n"
             "property float z\nend_header\n0000",
-            "could not be read as PLY",
+            "announces 1000000000000 rows of vertex, but its 4 bytes",
         ),
         ("claims.stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(50), "announces 4294967295 triangles.* but has 134"),
         ("cut.stl", "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "without 'endsolid'"),

@@ -47,7 +47,9 @@ def turk(
     Source: Turk (1991), doi:10.1145/127719.122749; Chen, Chi and Wu, arXiv 0907.1817, section 4, print
     s (u1 u2 - u2 - gamma) for the second rate.
     """
-    return Kinetics(_turk, dict(rate=jnp.asarray(rate), feed=jnp.asarray(feed), decay=jnp.asarray(decay), floor=jnp.asarray(floor)))
+    return Kinetics(
+        _turk, dict(rate=jnp.asarray(rate), feed=jnp.asarray(feed), decay=jnp.asarray(decay), floor=jnp.asarray(floor))
+    )
 
 
 def _turk(species, p):

@@ -13,7 +13,11 @@ def unit(vectors: Float[AnyArray, "*N 3"]) -> Float[AnyArray, "*N 3"]:
     xp = vectors.__array_namespace__()
     squared = xp.sum(vectors**2, axis=-1, keepdims=True)
     is_zero = squared == 0
-    return xp.where(is_zero, xp.broadcast_to(xp.eye(3, dtype=vectors.dtype)[2], vectors.shape), vectors / xp.sqrt(xp.where(is_zero, 1, squared)))
+    return xp.where(
+        is_zero,
+        xp.broadcast_to(xp.eye(3, dtype=vectors.dtype)[2], vectors.shape),
+        vectors / xp.sqrt(xp.where(is_zero, 1, squared)),
+    )
 
 
 def tangent_frames(normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 2 3"]:

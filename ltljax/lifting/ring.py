@@ -72,7 +72,9 @@ def centroid_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) 
     return unit(xp.sum(xp.where(has_face, weight, 0)[..., None] * face_normals, axis=0))
 
 
-def lifted_ring(offsets: Float[AnyArray, "K N 3"], frames: Float[AnyArray, "N 2 3"], lift: Lift) -> Float[AnyArray, "K N 2"]:
+def lifted_ring(
+    offsets: Float[AnyArray, "K N 3"], frames: Float[AnyArray, "N 2 3"], lift: Lift
+) -> Float[AnyArray, "K N 2"]:
     """The ring in the tangent plane, in the coordinates of the frame.
 
     ``"projection"`` drops the normal part (the paper's lift; lengths shrink). ``"chord"`` keeps the projected direction

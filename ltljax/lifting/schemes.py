@@ -4,6 +4,7 @@ What enters: positions and `Topology`. What leaves: `Geometry`, a record of ever
 """
 
 import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Bool, Float, Int
@@ -23,8 +24,7 @@ class Paper:
     has eigenvalues with positive real part, so that diffusion can grow. `Monotone` has none of these faults.
     """
 
-    name = "paper"
-    lift = "projection"
+    lift: ClassVar[Lift] = "projection"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,6 @@ class Monotone:
     """
 
     lift: Lift = "chord"
-    name = "monotone"
 
     def __post_init__(self):
         if self.lift not in ("chord", "projection"):
@@ -100,7 +99,9 @@ class Geometry(eqx.Module):
     laplacian_residual: Float[AnyArray, " V"] | None
 
 
-def ring_normals(vertices: Float[AnyArray, "V 3"], ring: Table, ring_blocks: tuple[RingTopology, ...]) -> Float[AnyArray, "V 3"]:
+def ring_normals(
+    vertices: Float[AnyArray, "V 3"], ring: Table, ring_blocks: tuple[RingTopology, ...]
+) -> Float[AnyArray, "V 3"]:
     """The paper's centroid-weighted unit normals."""
     return ring.map(lambda block, topology: centroid_normals(offsets(vertices, block), topology), ring_blocks)
 
@@ -110,12 +111,16 @@ def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "
     return block.neighbours(vertices) - block.centre(vertices)[None]
 
 
-def fitted_normals(vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table) -> Float[AnyArray, "V 3"]:
+def fitted_normals(
+    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table
+) -> Float[AnyArray, "V 3"]:
     """The given normals refined by the quadratic height fit on the jet table."""
     return jet.map(lambda block: quadratic.refined_normals(offsets(vertices, block), block.centre(normals)))
 
 
-def vertex_frames(vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], topology: Topology) -> Float[AnyArray, "V 2 3"]:
+def vertex_frames(
+    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], topology: Topology
+) -> Float[AnyArray, "V 2 3"]:
     """Tangent frames; at a boundary vertex the second vector is the outward conormal."""
 
     xp = vertices.__array_namespace__()
@@ -178,7 +183,11 @@ def weigh_in_frames(
 
 
 def diffusion_rows(
-    lift: Lift, vertices: Float[AnyArray, "V 3"], frames: Float[AnyArray, "V 2 3"], is_boundary: Bool[AnyArray, " V"], table: Table
+    lift: Lift,
+    vertices: Float[AnyArray, "V 3"],
+    frames: Float[AnyArray, "V 2 3"],
+    is_boundary: Bool[AnyArray, " V"],
+    table: Table,
 ) -> tuple[PerBlock, Float[AnyArray, " V"]]:
     """The non-negative Laplacian weights on a table, and the relative moment residual of every row."""
     rows = []

@@ -56,17 +56,14 @@ def lift_onto(vertices: np.ndarray, frames: np.ndarray, lift: Lift) -> LiftAt:
     return lift_at
 
 
-def merge_rows(rows: Rows, replaced: np.ndarray, by: list[np.ndarray]) -> Rows:
-    """The rows with those of the vertices ``replaced`` exchanged for the lists in ``by``."""
+def merge_rows(rows: Rows, replaced: dict[int, np.ndarray]) -> Rows:
+    """The rows with those of some vertices replaced."""
     offsets, indices = rows
-    lists = dict(zip(replaced.tolist(), by, strict=True))
-    if not lists:
-        return rows
     lengths = np.diff(offsets)
-    lengths[replaced] = [len(row) for row in by]
     pieces, start = [], 0
-    for vertex in sorted(lists):
-        pieces += [indices[start : offsets[vertex]], lists[vertex]]
+    for vertex in sorted(replaced):
+        lengths[vertex] = len(replaced[vertex])
+        pieces += [indices[start : offsets[vertex]], replaced[vertex]]
         start = offsets[vertex + 1]
     pieces.append(indices[start:])
     return np.concatenate([[0], np.cumsum(lengths)]), np.concatenate(pieces).astype(indices.dtype)
@@ -88,19 +85,15 @@ def fit_support(rings: Rows, is_well_placed: np.ndarray, k_ring: KRing, lift_at:
         lift_at: the lifted coordinates of neighbours.
     """
     wanting = np.flatnonzero(~is_well_placed)
-    chosen: list[np.ndarray] = []
-    two = split_rows(k_ring(wanting, 2)) if len(wanting) else []
-    three = {}
-    still = [
-        vertex
-        for vertex, row in zip(wanting, two, strict=True)
-        if not determines_quadratic(lift_at(vertex, row)[:, None])[0]
-    ]
-    if still:
-        three = dict(zip(still, split_rows(k_ring(np.asarray(still), 3)), strict=True))
-    for vertex, row in zip(wanting, two, strict=True):
-        chosen.append(three.get(vertex, row))
-    return merge_rows(rings, wanting, chosen)
+    chosen: dict[int, np.ndarray] = {}
+    for ring in range(2, _LARGEST_RING + 1):
+        if not len(wanting):
+            break
+        chosen.update(zip(wanting.tolist(), split_rows(k_ring(wanting, ring)), strict=True))
+        wanting = np.array(
+            [v for v in wanting.tolist() if not determines_quadratic(lift_at(v, chosen[v])[:, None])[0]], np.int64
+        )
+    return merge_rows(rings, chosen)
 
 
 def determines_quadratic(lifted: np.ndarray) -> np.ndarray:
@@ -117,7 +110,7 @@ def nonnegative_support(
     k_ring: KRing,
     lift_at: LiftAt,
 ) -> tuple[Rows, SupportRecord]:
-    """Rows on which the Laplacian has non-negative weights: the one-ring, else what least squares picks from wider rings.
+    """Rows on which Laplacian weights are non-negative: the one-ring, else what least squares picks from wider rings.
 
     For a vertex whose one-ring has a negative weight, non-negative least squares solves the five moment conditions on
     two rings, then on three, with columns scaled by r^-4 so that near neighbours win. It uses at most five neighbours.
@@ -144,9 +137,7 @@ def nonnegative_support(
                 best[vertex] = candidates[picked]
                 residual[vertex], used_rings[vertex] = found, ring
         wanting = wanting[~(residual[wanting] <= CONSISTENT)]
-    replaced = np.array(sorted(best), dtype=np.int64)
-    rows = merge_rows(rings, replaced, [best[vertex] for vertex in replaced.tolist()])
-    return rows, SupportRecord(used_rings, residual)
+    return merge_rows(rings, best), SupportRecord(used_rings, residual)
 
 
 def _nonnegative_row(lifted: np.ndarray, is_boundary: bool) -> tuple[np.ndarray, float]:

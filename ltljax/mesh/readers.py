@@ -6,9 +6,13 @@ it into a `MeshError`. A reader raises one itself where it knows better what is 
 Other packages are imported where they are used: who computes on a built-in shape need not wait for them.
 """
 
+import importlib.util
 import io
 import json
 import struct
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from .errors import MeshError
-from .text_formats import Polygons, fan, parse_obj, parse_off, parse_text_ply
+from .ply import parse_ply
+from .text_formats import Polygons, fan, parse_obj, parse_off
 
 
 def read_obj(path: Path) -> Polygons:
@@ -32,12 +37,7 @@ def read_off(path: Path) -> Polygons:
 
 def read_ply(path: Path) -> Polygons:
     """PLY, text or binary."""
-    from trimesh.exchange.ply import load_ply
-
-    data = path.read_bytes()
-    if b"format ascii" in data.partition(b"end_header")[0]:
-        return parse_text_ply(data)
-    return _polygons(load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True))
+    return parse_ply(path.read_bytes())
 
 
 def read_stl(path: Path) -> Polygons:
@@ -85,7 +85,9 @@ def read_gltf(path: Path) -> Polygons:
 
 def read_meshio(path: Path) -> Polygons:
     """VTK, VTU and Gmsh: their triangles, quadrangles and polygons; of curved elements the corners."""
-    meshio = _extra("meshio", "io")
+    _require("meshio", "io")
+    import meshio
+
     try:
         grid = meshio.read(path)
     except (Exception, SystemExit):
@@ -106,20 +108,43 @@ def read_meshio(path: Path) -> Polygons:
     return Polygons(_in_space(np.asarray(grid.points)), np.concatenate(pieces))
 
 
+# Run by a child process: reads a file and saves the arrays, or says what the file holds instead.
+_READ_VTK = """
+import sys, numpy, pyvista
+surface = pyvista.read(sys.argv[1])
+if not isinstance(surface, pyvista.PolyData):
+    sys.exit(type(surface).__name__)
+triangles = surface.triangulate()
+numpy.savez(sys.argv[2], points=triangles.points, faces=numpy.reshape(triangles.faces, (-1, 4))[:, 1:])
+"""
+
+
 def read_vtk(path: Path) -> Polygons:
-    """VTK surfaces (POLYDATA), text, binary or XML."""
-    pyvista = _extra("pyvista", "viz")
-    surface = pyvista.read(path)
-    if not isinstance(surface, pyvista.PolyData):
-        raise MeshError(f"expected a surface (PolyData), found {type(surface).__name__}. Extract the surface first.")
-    triangles = surface.triangulate()
-    return Polygons(np.asarray(triangles.points), np.asarray(triangles.faces).reshape(-1, 4)[:, 1:])
+    """VTK surfaces (POLYDATA), text, binary or XML.
+
+    In a process of its own: on damaged files VTK ends the process that reads them, and a notebook with it.
+    """
+    _require("pyvista", "viz")
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "surface.npz"
+        command = [sys.executable, "-c", _READ_VTK, str(path.absolute()), str(target)]
+        done = subprocess.run(command, capture_output=True, timeout=600, check=False)
+        if not target.exists():
+            lines = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
+            reason = lines[-1][:200] if lines else f"the reader ended with code {done.returncode}"
+            raise MeshError(
+                f"expected a VTK surface (PolyData), found: {reason}. Extract the surface or export it again."
+            )
+        with np.load(target) as arrays:
+            return Polygons(arrays["points"], arrays["faces"])
 
 
 def read_gifti(path: Path) -> Polygons:
     """GIfTI surfaces, as brain atlases use them."""
-    nibabel = _extra("nibabel", "io")
-    image = nibabel.load(path)
+    _require("nibabel", "io")
+    import nibabel
+
+    image: Any = nibabel.load(path)
     points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
     triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
     if not points or not triangles:
@@ -148,12 +173,10 @@ def _resolver(path: Path) -> Any:
     return FilePathResolver(str(path))
 
 
-def _extra(module: str, extra: str) -> Any:
-    """The optional module, or an error that names the extra to install."""
-    try:
-        return __import__(module)
-    except ImportError as error:
-        raise MeshError(f'reading this kind of file needs {module}. Run: pip install "ltljax[{extra}]"') from error
+def _require(module: str, extra: str) -> None:
+    """Raises an error that names the extra to install, where the optional module is missing."""
+    if importlib.util.find_spec(module) is None:
+        raise MeshError(f'reading this kind of file needs {module}. Run: pip install "ltljax[{extra}]"')
 
 
 def _in_space(points: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""The formats that are lines of text: OBJ, OFF and the text form of PLY.
+"""The formats that are lines of text: OBJ and OFF, and what the text form of PLY shares with them.
 
 What enters: the bytes of a file. What leaves: `Polygons`, unchecked.
 
 trimesh reads these too, but with the eye of a renderer. It splits the vertices of an OBJ at texture seams, drops those
 without a face and regroups by material, so that the order of the file, which per-vertex data follow, is lost; and it
-takes an OFF or a PLY that ends too early for a complete one.
+takes an OFF that ends too early for a complete one.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ class Polygons(NamedTuple):
     faces: np.ndarray
 
 
-def fan(corners: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+def fan(corners: Sequence[int] | np.ndarray, sizes: Sequence[int] | np.ndarray) -> np.ndarray:
     """Triangles (F, 3) that fan out from the first corner of each polygon.
 
     Args:
         corners: the corners of all polygons, one after the other.
         sizes: the number of corners of each polygon.
     """
-    flat, counts = np.array(corners, dtype=np.int64), np.array(sizes, dtype=np.int64)
+    flat, counts = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
     if np.any(counts < 3):
         first = int(np.flatnonzero(counts < 3)[0])
         raise MeshError(f"face {first} has {counts[first]} corners; it needs at least three. Correct or remove it.")
@@ -76,37 +76,12 @@ def parse_off(data: bytes) -> Polygons:
     if not rows or len(rows[0]) < 2:
         raise MeshError("expected the numbers of vertices and faces after the head. Export or download the file again.")
     num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
-    vertex_rows = _rows(rows, 1, num_vertices, "vertices")
-    face_rows = _rows(rows, 1 + num_vertices, num_faces, "faces")
-    return Polygons(_coordinates(vertex_rows, [0, 1, 2]), _polygon_rows(face_rows, 0))
+    vertex_rows = next_rows(rows, 1, num_vertices, "vertices")
+    face_rows = next_rows(rows, 1 + num_vertices, num_faces, "faces")
+    return Polygons(coordinates(vertex_rows, [0, 1, 2]), polygon_rows(face_rows, 0))
 
 
-def parse_text_ply(data: bytes) -> Polygons:
-    """PLY in its text form."""
-    head, _, body = data.decode("utf-8", errors="replace").partition("end_header")
-    elements: list[tuple[str, int, list[str], list[str]]] = []  # name, count, names and types of the properties
-    for words in map(str.split, head.splitlines()):
-        if words[:1] == ["element"]:
-            elements.append((words[1], int(words[2]), [], []))
-        elif words[:1] == ["property"]:
-            elements[-1][2].append(words[-1])
-            elements[-1][3].append(words[1])
-    rows = [words for line in body.splitlines() if (words := line.split())]
-    vertices, faces, position = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
-    for name, count, names, types in elements:
-        here = _rows(rows, position, count, name)
-        position += count
-        if name == "vertex":
-            if "list" in types:
-                raise MeshError("vertices have a property that is a list. Export the file with plain coordinates.")
-            vertices = _coordinates(here, [names.index(axis) for axis in "xyz"])
-        elif name == "face" and "list" in types:
-            # What comes before the first list is one word each.
-            faces = _polygon_rows(here, types.index("list"))
-    return Polygons(vertices, faces)
-
-
-def _rows(rows: list[list[str]], start: int, count: int, what: str) -> list[list[str]]:
+def next_rows(rows: list[list[str]], start: int, count: int, what: str) -> list[list[str]]:
     """The next ``count`` rows, all of them."""
     found = rows[start : start + count] if count > 0 else []
     if len(found) != count:
@@ -117,7 +92,7 @@ def _rows(rows: list[list[str]], start: int, count: int, what: str) -> list[list
     return found
 
 
-def _coordinates(rows: list[list[str]], columns: list[int]) -> np.ndarray:
+def coordinates(rows: list[list[str]], columns: list[int]) -> np.ndarray:
     """The positions (V, 3) in three columns of the rows."""
     if any(len(row) <= max(columns) for row in rows):
         first = next(index for index, row in enumerate(rows) if len(row) <= max(columns))
@@ -126,7 +101,7 @@ def _coordinates(rows: list[list[str]], columns: list[int]) -> np.ndarray:
     return np.array([(float(row[x]), float(row[y]), float(row[z])) for row in rows]).reshape(-1, 3)
 
 
-def _polygon_rows(rows: list[list[str]], lead: int) -> np.ndarray:
+def polygon_rows(rows: list[list[str]], lead: int) -> np.ndarray:
     """The triangles of rows that hold, after ``lead`` other words, the number of corners and the corners."""
     corners: list[int] = []
     sizes: list[int] = []

@@ -12,14 +12,16 @@ import trimesh
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
     """Write a binary PLY with per-vertex colours (V, 4) of unsigned bytes."""
     surface = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
-    path.write_bytes(surface.export(file_type="ply"))
+    data = surface.export(file_type="ply")
+    assert isinstance(data, bytes)
+    path.write_bytes(data)
 
 
 def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[str, np.ndarray]) -> None:
     """Write a VTK PolyData file (``.vtp``) with fields on the vertices, (V,) or (V, C).
 
-    XML with inline arrays, compressed, which ParaView and every VTK reader open; written here so that results can be kept
-    where no VTK is installed.
+    XML with compressed arrays inside, which ParaView and every VTK reader open. Written here so that results can be
+    kept where no VTK is installed.
 
     Source: VTK file formats, section XML.
     """

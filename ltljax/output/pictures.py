@@ -31,16 +31,23 @@ class Picture:
     """
 
     def __init__(
-        self, vertices: np.ndarray, faces: np.ndarray, title: str, limits: tuple[float, float], colormap: str = "viridis"
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        title: str,
+        limits: tuple[float, float],
+        colormap: str = "viridis",
     ):
         import pyvista
 
-        self._surface = pyvista.PolyData.from_regular_faces(vertices, faces)
+        # PyVista's own annotations of its plotter are too narrow for a type checker.
+        plotter: Any = pyvista.Plotter
+        self._surface: Any = pyvista.PolyData.from_regular_faces(vertices, faces)
         self._surface[title] = np.full(len(vertices), limits[0])
         self._title = title
         # Without a display VTK says so before it renders off-screen all the same.
         with pyvista.vtk_verbosity("error"):
-            self._plotter = pyvista.Plotter(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
+            self._plotter = plotter(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
             for column, view in enumerate(_VIEWS):
                 self._plotter.subplot(0, column)
                 self._plotter.set_background("white")
@@ -54,7 +61,13 @@ class Picture:
                     ambient=0.25,
                     show_scalar_bar=column == 1,
                     scalar_bar_args=dict(
-                        title=title, color="black", vertical=True, position_x=0.88, position_y=0.2, height=0.6
+                        title=title,
+                        color="black",
+                        vertical=True,
+                        fmt="%.3g",
+                        position_x=0.84,
+                        position_y=0.2,
+                        height=0.6,
                     ),
                 )
                 self._plotter.view_vector(view, viewup=(0, 1, 0))
@@ -87,14 +100,15 @@ def write_animation(path: Path, images: Iterable[np.ndarray]) -> Path:
     """Write pictures as an MP4, or as a GIF beside it where no encoder is installed; returns the file written."""
     import imageio.v2
 
+    write: Any = imageio.v2.mimwrite
     frames = list(images)
     with warnings.catch_warnings():
         # The encoder is a program of its own, started by fork and exec; JAX warns of forks that go on in Python.
         warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
         try:
-            imageio.v2.mimwrite(path, frames, fps=_FRAMES_PER_SECOND, quality=8)  # pyright: ignore[reportArgumentType]
+            write(path, frames, fps=_FRAMES_PER_SECOND, quality=8)
         except (ValueError, ImportError, OSError, RuntimeError):
             path = path.with_suffix(".gif")
             seconds = 1000 / _FRAMES_PER_SECOND
-            imageio.v2.mimwrite(path, frames, duration=seconds, loop=0)  # pyright: ignore[reportArgumentType]
+            write(path, frames, duration=seconds, loop=0)
     return path

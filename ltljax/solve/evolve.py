@@ -1,16 +1,18 @@
 """`solve`: an equation, a surface and an initial state become a trajectory. The door to diffrax."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
 
 from ..equations import Equation
 from ..lifting.schemes import Paper
 from ..surface import Surface
+from ..tables import AnyArray
 from .chebyshev import RKC2
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
@@ -70,14 +72,14 @@ class Solution(eqx.Module):
 def solve(
     equation: Equation,
     surface: Surface,
-    u0: Float[Array, "V *S"],
-    t1: float | Float[Array, ""],
-    ts: Float[Array, " T"] | None = None,
+    u0: Float[AnyArray, "V *S"],
+    t1: ArrayLike,
+    ts: ArrayLike | Sequence[float] | None = None,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress: bool | diffrax.AbstractProgressMeter = False,
     *,
-    t0: float | Float[Array, ""] = 0.0,
+    t0: ArrayLike = 0.0,
     rtol: float = 1e-4,
     atol: float = 1e-6,
     max_steps: int | None = 1_000_000,
@@ -128,7 +130,7 @@ def solve(
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         _meter(progress), rtol, atol, max_steps,
     )  # fmt: skip
-    if throw and not isinstance(solution.t_end, jax.core.Tracer):
+    if throw and not isinstance(solution.t_end, Tracer):
         solution.check(surface)
     return solution
 
@@ -188,11 +190,11 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
         throw=False,
         progress_meter=meter,
     )
-    (ts, t_end), (us, u_end) = out.ts, out.ys
+    (ts, t_end), (us, u_end) = cast(Any, out.ts), cast(Any, out.ys)
     stats = {name: out.stats[name] for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     if keeps_state:
-        stats["num_evaluations"] = out.solver_state[1]
-    return Solution(ts, us, t_end[0], u_end[0], stats, out.result, out.event_mask)
+        stats["num_evaluations"] = cast(Any, out.solver_state)[1]
+    return Solution(ts, us, t_end[0], u_end[0], stats, out.result, cast(Array, out.event_mask))
 
 
 def _cause_of_overflow(surface: Surface) -> str:

@@ -1,0 +1,165 @@
+"""The PLY format, text and binary.
+
+What enters: the bytes of a file. What leaves: `Polygons`, unchecked.
+
+trimesh reads PLY too, but takes the number of corners of the first face for that of all: a binary file of triangles and
+quadrangles is refused, or misread where the lengths happen to agree.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .errors import MeshError
+from .text_formats import Polygons, coordinates, fan, next_rows, polygon_rows
+
+_CODES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class _Property(NamedTuple):
+    name: str
+    code: str
+    size_code: str | None  # of a list, the type of its length
+
+
+class _Element(NamedTuple):
+    name: str
+    rows: int
+    properties: list[_Property]
+
+
+def parse_ply(data: bytes) -> Polygons:
+    """PLY, text or binary."""
+    head, end, body = data.partition(b"end_header")
+    if not head.startswith(b"ply") or not end:
+        raise MeshError("expected a head from 'ply' to 'end_header'. The file is damaged or not PLY.")
+    kind, elements = _parse_head(head.decode("utf-8", errors="replace"))
+    if kind == "ascii":
+        return _parse_text(body.decode("utf-8", errors="replace"), elements)
+    if kind not in _BYTE_ORDERS:
+        raise MeshError(f"the format {kind!r} is not known. Export as ascii or binary_little_endian.")
+    # One line end belongs to the head; the next byte is data, even if it looks like another.
+    return _parse_binary(body[2:] if body[:2] == b"\r\n" else body[1:], elements, _BYTE_ORDERS[kind])
+
+
+def _parse_head(head: str) -> tuple[str, list[_Element]]:
+    kind, elements = "", []
+    for words in map(str.split, head.splitlines()):
+        match words:
+            case ["format", name, *_]:
+                kind = name
+            case ["element", name, count]:
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", size_type, type_, name]:
+                elements[-1].properties.append(_Property(name, _CODES[type_], _CODES[size_type]))
+            case ["property", type_, name]:
+                elements[-1].properties.append(_Property(name, _CODES[type_], None))
+            case _:  # comments
+                pass
+    return kind, elements
+
+
+def _corner_list(element: _Element) -> int | None:
+    """Which property holds the corners of a face: the list of that name, else the first list."""
+    lists = [index for index, item in enumerate(element.properties) if item.size_code]
+    named = [index for index in lists if element.properties[index].name in ("vertex_indices", "vertex_index")]
+    return (named or lists or [None])[0]
+
+
+def _parse_text(body: str, elements: list[_Element]) -> Polygons:
+    rows = [words for line in body.splitlines() if (words := line.split())]
+    vertices, faces, position = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
+    for element in elements:
+        here = next_rows(rows, position, element.rows, element.name)
+        position += element.rows
+        names = [item.name for item in element.properties]
+        which = _corner_list(element)
+        lead = element.properties[:which]
+        if any(item.size_code for item in lead) and element.name in ("vertex", "face"):
+            raise MeshError(f"the list {lead[0].name!r} stands before the numbers of interest. Export without it.")
+        if element.name == "vertex":
+            vertices = coordinates(here, [names.index(axis) for axis in "xyz"])
+        elif element.name == "face" and which is not None:
+            faces = polygon_rows(here, which)
+    return Polygons(vertices, faces)
+
+
+def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons:
+    vertices, faces, offset = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
+    for element in elements:
+        which = _corner_list(element)
+        if which is None:
+            dtype = np.dtype([(item.name, order + item.code) for item in element.properties])
+            _expect(body, offset, element.rows * dtype.itemsize, element)
+            rows = np.frombuffer(body, dtype, element.rows, offset)
+            offset += element.rows * dtype.itemsize
+            if element.name == "vertex":
+                vertices = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        else:
+            corners, sizes, offset = _list_rows(body, element, order, offset, which)
+            if element.name == "face":
+                faces = fan(corners, sizes)
+    return Polygons(vertices, faces)
+
+
+def _list_rows(
+    body: bytes, element: _Element, order: str, offset: int, which: int
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The entries of one list of all rows, their numbers, and where the next element begins."""
+    if element.rows <= 0:
+        _expect(body, offset, element.rows, element)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), offset
+    # Mostly all rows are alike: then they are one array.
+    spans, stop = _row(body, element, order, offset)
+    fields = []
+    for index, (item, (_, size)) in enumerate(zip(element.properties, spans, strict=True)):
+        if item.size_code:
+            fields.append((f"size {index}", order + item.size_code))
+        fields.append((f"data {index}", order + item.code, (size,)))
+    dtype = np.dtype(fields)
+    if offset + element.rows * dtype.itemsize <= len(body):
+        rows = np.frombuffer(body, dtype, element.rows, offset)
+        lists = [index for index, item in enumerate(element.properties) if item.size_code]
+        if all(np.all(rows[f"size {index}"] == spans[index][1]) for index in lists):
+            corners = rows[f"data {which}"].astype(np.int64).ravel()
+            sizes = np.full(element.rows, spans[which][1])
+            return corners, sizes, offset + element.rows * dtype.itemsize
+    pieces, numbers = [], []
+    code = order + element.properties[which].code
+    for _ in range(element.rows):
+        spans, stop = _row(body, element, order, offset)
+        start, size = spans[which]
+        pieces.append(np.frombuffer(body, code, size, start))
+        numbers.append(size)
+        offset = stop
+    return np.concatenate(pieces).astype(np.int64), np.array(numbers), offset
+
+
+def _row(body: bytes, element: _Element, order: str, offset: int) -> tuple[list[tuple[int, int]], int]:
+    """Where each property of one row begins and how many entries it has, and where the next row begins."""
+    spans = []
+    for item in element.properties:
+        size = 1
+        if item.size_code:
+            length = int(item.size_code[1])
+            _expect(body, offset, length, element)
+            size = int(np.frombuffer(body, order + item.size_code, 1, offset)[0])
+            offset += length
+        spans.append((offset, size))
+        _expect(body, offset, size * int(item.code[1]), element)
+        offset += size * int(item.code[1])
+    return spans, offset
+
+
+def _expect(body: bytes, offset: int, length: int, element: _Element) -> None:
+    """Raises where the file does not hold what its head announces."""
+    if length < 0 or offset + length > len(body):
+        raise MeshError(
+            f"the file announces {element.rows} rows of {element.name}, but its {len(body)} bytes of data end before "
+            "them. It may be truncated: export or download it again."
+        )

@@ -1,0 +1,191 @@
+"""The command line as a person uses it: what it prints and writes, and what it says of mistakes."""
+
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+
+import ltljax as ltl
+from ltljax.cli import main
+from ltljax.output import files, pictures
+
+
+@pytest.fixture
+def mesh_file(tmp_path):
+    """Write a mesh to a PLY and return its path."""
+
+    def write(mesh):
+        path = tmp_path / "mesh.ply"
+        files.write_ply(path, mesh.vertices, mesh.faces, np.full((mesh.num_vertices, 4), 255, np.uint8))
+        return str(path)
+
+    return write
+
+
+def fails(capsys, *arguments):
+    """The exit code and the standard error of a run that fails."""
+    try:
+        code = main(list(arguments))
+    except SystemExit as stop:
+        code = stop.code
+    return code, capsys.readouterr().err
+
+
+def test_a_run_writes_picture_animation_series_surface_and_summary(tmp_path, mesh_file, capsys):
+    out = tmp_path / "out"
+    mesh = ltl.shapes.icosphere(3)
+    assert main(["run", "turing", "--mesh", mesh_file(mesh), "--out", str(out), "--frames", "4"]) == 0
+    assert {p.name for p in out.iterdir()} == {
+        "turing.png", "turing.mp4", "turing.pvd", "turing.ply", "series", "summary.json",
+    }  # fmt: skip
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["mesh"]["vertices"] == 642
+    assert summary["versions"]["jax"]
+    assert summary["options"]["seed"] == 0
+    assert summary["failure"] is None
+    assert 30 <= summary["measured"]["maxima_of_u2"] <= 60
+    printed = capsys.readouterr()
+    assert "scaled by" in printed.out
+    assert "maxima of u2" in printed.out
+    assert "100%" in printed.err
+    saved = trimesh.load(out / "turing.ply", process=False)
+    assert saved.visual.vertex_colors.shape == (642, 4)
+    assert len(np.unique(saved.visual.vertex_colors, axis=0)) > 50
+
+
+def test_the_series_is_read_back_by_vtk_to_the_last_bit(tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    mesh = ltl.shapes.icosphere(2)
+    fields = {"u": np.arange(162.0), "X": np.random.default_rng(0).normal(size=(162, 3)).astype(np.float32)}
+    files.write_vtp(tmp_path / "a.vtp", mesh.vertices, mesh.faces, fields)
+    files.write_series(tmp_path / "a.pvd", np.array([0.5]), ["a.vtp"])
+    read = pyvista.PVDReader(tmp_path / "a.pvd").read()[0]
+    np.testing.assert_array_equal(read.points, mesh.vertices)
+    np.testing.assert_array_equal(read.regular_faces, mesh.faces)
+    for name, values in fields.items():
+        np.testing.assert_array_equal(read[name], values)
+    entry = xml.etree.ElementTree.parse(tmp_path / "a.pvd").getroot()[0][0]
+    assert entry.attrib == {"timestep": "0.5", "file": "a.vtp"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--mesh", "sphere"], "relative error L2"),
+        (["--mesh", "torus", "--source", "sine"], "relative error L2"),
+        (["--mesh", "torus"], "range over +-2.1257"),
+        (["--mesh", "torus", "--source", "angle"], "the mean of u grows like pi t"),
+    ],
+)
+def test_heat_reaches_its_stationary_state(tmp_path, capsys, monkeypatch, arguments, says):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    assert main(["run", "heat", *arguments, "--out", str(tmp_path), "--frames", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert says in printed
+    measured = json.loads((tmp_path / "summary.json").read_text())["measured"]
+    if "relative_error_L2" in measured:
+        assert measured["relative_error_L2"] < 2e-3
+    elif "angle" in arguments:
+        assert measured["mass_at_end"][0] == pytest.approx(np.pi * 10 * 8 * np.pi**2, rel=0.03)
+    else:
+        np.testing.assert_allclose(measured["range_of_u"], (-2.1257, 2.1257), rtol=5e-3)
+
+
+def test_the_published_turing_parameters_stay_uniform(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    arguments = ["run", "turing", "--as-published", "--mesh", "torus", "--out", str(tmp_path), "--frames", "1"]
+    assert main(arguments) == 0
+    assert "stays uniform and tends to (1, 16)" in capsys.readouterr().out
+    measured = json.loads((tmp_path / "summary.json").read_text())["measured"]
+    assert measured["maxima_of_u2"] == 0
+    assert measured["relative_error_max"] < 1e-3
+
+
+def test_without_the_picture_extra_a_run_goes_through_and_says_how_to_get_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    assert main(["run", "heat", "--out", str(tmp_path), "--frames", "20", "--dtype", "float64"]) == 0
+    printed = capsys.readouterr()
+    assert 'pip install "ltljax[viz]"' in printed.out
+    assert "s left" in printed.err
+    assert (tmp_path / "heat.pvd").exists()
+    assert not (tmp_path / "heat.png").exists()
+
+
+def test_the_published_scheme_on_an_irregular_mesh_stops_with_its_time_and_reason(tmp_path, mesh_file, capsys):
+    path, out = mesh_file(ltl.shapes.jittered_sphere(3, 0.3, seed=0)), tmp_path / "out"
+    code, said = fails(capsys, "run", "heat", "--mesh", path, "--scheme", "paper", "--out", str(out), "--frames", "5")
+    assert code == 1
+    assert "overflowed at t = " in said
+    assert "has growing modes on such meshes" in said.splitlines()[-1]
+    assert "overflowed" in json.loads((out / "summary.json").read_text())["failure"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "cooking"], "invalid choice: 'cooking'"),
+        (["run", "heat", "--mesh", "nowhere.obj"], "nowhere.obj"),
+        (["run", "heat", "--t1", "-1"], "expected a positive number, found '-1'"),
+        (["run", "heat", "--t1", "nan"], "expected a positive number"),
+        (["run", "heat", "--frames", "0"], "expected a whole number from 1"),
+        (["run", "heat", "--seed", "x"], "expected a whole number from 0"),
+        (["run", "heat", "--source", "sine"], "needs --mesh torus"),
+        (["run", "turing", "--source", "sine"], "belongs to heat"),
+        (["run", "heat", "--as-published"], "belongs to turing"),
+        (["run", "heat", "--dtype", "float16"], "invalid choice"),
+        (["info", "."], "ltljax: "),
+        ([], "the following arguments are required: COMMAND"),
+    ],
+)
+def test_a_wrong_argument_gets_one_line_and_exit_code_two(capsys, arguments, says):
+    code, said = fails(capsys, *arguments)
+    assert code == 2
+    assert says in said
+    assert len(said.strip().splitlines()) == 1
+    assert "Traceback" not in said
+
+
+def test_an_output_folder_that_cannot_be_made_is_one_line_too(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    code, said = fails(capsys, "run", "heat", "--out", str(tmp_path / "taken"))
+    assert code == 2
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_info_prints_the_report_and_list_the_scenarios(capsys, mesh_file):
+    assert main(["info", mesh_file(ltl.shapes.icosphere(2))]) == 0
+    assert "162" in capsys.readouterr().out
+    assert main(["list"]) == 0
+    assert "turing" in capsys.readouterr().out
+
+
+def test_a_float32_run_needs_no_float64(tmp_path):
+    arguments = ["run", "heat", "--dtype", "float32", "--frames", "2", "--out", str(tmp_path)]
+    code = f"import sys; from ltljax.output import pictures; pictures.can_draw = lambda: False\nfrom ltljax.cli import main; sys.exit(main({arguments}))"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    measured = json.loads((tmp_path / "summary.json").read_text())["measured"]
+    assert measured["relative_error_L2"] < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["spot.obj", "armadillo.obj", "hand_open.obj", "spot_low.obj"])
+def test_real_meshes_get_their_spots(tmp_path, real_mesh, monkeypatch, name):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    assert main(["run", "turing", "--mesh", str(real_mesh(name)), "--out", str(tmp_path), "--frames", "2"]) == 0
+    measured = json.loads((tmp_path / "summary.json").read_text())["measured"]
+    assert 35 <= measured["maxima_of_u2"] <= 60
+
+
+@pytest.mark.slow
+def test_the_published_scheme_overflows_on_spot(tmp_path, real_mesh, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    mesh = str(real_mesh("spot.obj"))
+    code, said = fails(capsys, "run", "turing", "--mesh", mesh, "--scheme", "paper", "--out", str(tmp_path))
+    assert code == 1
+    assert "overflowed at t = 0.0" in said
