@@ -40,41 +40,36 @@ class Picture:
     ):
         import pyvista
 
-        # PyVista's own annotations of its plotter are too narrow for a type checker.
-        plotter: Any = pyvista.Plotter
         self._surface: Any = pyvista.PolyData.from_regular_faces(vertices, faces)
         self._surface[title] = np.full(len(vertices), limits[0])
         self._title = title
-        # Without a display VTK says so before it renders off-screen all the same.
-        with pyvista.vtk_verbosity("error"):
-            self._plotter = plotter(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
-            for column, view in enumerate(_VIEWS):
-                self._plotter.subplot(0, column)
-                self._plotter.set_background("white")
-                self._plotter.add_mesh(
-                    self._surface,
-                    scalars=title,
-                    clim=limits,
-                    cmap=colormap,
-                    smooth_shading=True,
-                    interpolate_before_map=True,
-                    ambient=0.25,
-                    show_scalar_bar=column == 1,
-                    scalar_bar_args=dict(
-                        title=title,
-                        color="black",
-                        vertical=True,
-                        fmt="%.3g",
-                        position_x=0.84,
-                        position_y=0.2,
-                        height=0.6,
-                    ),
-                )
-                self._plotter.view_vector(view, viewup=(0, 1, 0))
-                self._plotter.camera.zoom(1.25)
-            self._plotter.show(auto_close=False)
-        self._plotter.subplot(0, 0)
         self._text: Any = None
+        # Without a display VTK says so before it renders off-screen all the same.
+        self._quiet = pyvista.vtk_verbosity
+        with self._quiet("error"):
+            self._plotter = self._compose(pyvista.Plotter, limits, colormap)
+
+    def _compose(self, plotter_class: Any, limits: tuple[float, float], colormap: str) -> Any:
+        plotter = plotter_class(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
+        bar = dict(color="black", vertical=True, fmt="%.3g", position_x=0.84, position_y=0.2, height=0.6)
+        for column, view in enumerate(_VIEWS):
+            plotter.subplot(0, column)
+            plotter.set_background("white")
+            plotter.add_mesh(
+                self._surface,
+                scalars=self._title,
+                clim=limits,
+                cmap=colormap,
+                smooth_shading=True,
+                interpolate_before_map=True,
+                ambient=0.25,
+                show_scalar_bar=column == 1,
+                scalar_bar_args=dict(title=self._title, **bar),
+            )
+            plotter.view_vector(view, viewup=(0, 1, 0))
+            plotter.camera.zoom(1.25)
+        plotter.subplot(0, 0)
+        return plotter
 
     def draw(self, values: np.ndarray, caption: str = "") -> np.ndarray:
         """The picture (height, width, 3) of unsigned bytes of the field's values (V,)."""
@@ -82,7 +77,8 @@ class Picture:
         if self._text is not None:
             self._plotter.remove_actor(self._text)
         self._text = self._plotter.add_text(caption, position="lower_left", font_size=11, color="black")
-        return np.asarray(self._plotter.screenshot(return_img=True))
+        with self._quiet("error"):
+            return np.asarray(self._plotter.screenshot(return_img=True))
 
     def close(self) -> None:
         """Free the renderer."""
