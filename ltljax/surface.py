@@ -95,7 +95,8 @@ class Surface(eqx.Module):
 
         Raises:
             TypeError: no mesh was given.
-            ValueError: the dtype is no float, or is float64 while JAX has 64-bit numbers switched off.
+            ValueError: the dtype is no float, or is float64 while JAX has 64-bit numbers switched off, or the mesh is
+                so small that its weights leave the range of the dtype.
         """
         if not isinstance(mesh, Mesh):
             raise TypeError(
@@ -107,7 +108,13 @@ class Surface(eqx.Module):
         dtype = _float_dtype(dtype)
         topology, report = _freeze(mesh, scheme)
         # On the host in NumPy, where float64 is always at hand and nothing has to be compiled for the mesh's size.
-        geometry = _cast(weigh(scheme, mesh.vertices, topology), dtype)
+        with np.errstate(over="ignore"):  # an overflow of the cast is found below
+            geometry = _cast(weigh(scheme, mesh.vertices, topology), dtype)
+        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(geometry)):
+            raise ValueError(
+                f"Weights grow like 1 / length^2, and at a mesh size of {mesh.mesh_size:.3g} they leave the range of "
+                f"{jnp.dtype(dtype).name}. Rescale the mesh (mesh.scaled(factor)) or use float64."
+            )
         topology = jax.tree.map(jnp.asarray, topology)
         return cls(topology, geometry, scheme, report)
 

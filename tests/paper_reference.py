@@ -1,6 +1,9 @@
 """The formulas of Chen, Chi and Wu (arXiv 0907.1817), transcribed one vertex at a time in NumPy.
 
 Slow on purpose and written without a look at the package: the independent word the tests hold `ltl.Paper()` to.
+
+`angles` turns the basis of each tangent plane; `at` names the vertices to work at (all of them by default), and what
+is not asked for is NaN.
 """
 
 import numpy as np
@@ -47,12 +50,14 @@ def lifted_faces(vertices, v, pairs, frame):
     return [(i, j, corners, weight / total) for i, j, corners, weight in out]
 
 
-def gradients(vertices, faces, u, angles=None):
+def gradients(vertices, faces, u, angles=None, at=None):
     """Gradient (V, 3): the affine gradient of each lifted face, averaged with the centroid weights."""
     around = faces_at(faces, len(vertices))
-    out = np.zeros((len(vertices), 3))
-    for v, pairs in enumerate(around):
+    out = np.full((len(vertices), 3), np.nan)
+    for v in range(len(vertices)) if at is None else at:
+        pairs = around[v]
         frame = basis(normal(vertices, v, pairs), 0.0 if angles is None else angles[v])
+        out[v] = 0
         for i, j, corners, weight in lifted_faces(vertices, v, pairs, frame):
             out[v] += weight * np.linalg.solve(corners, [u[i] - u[v], u[j] - u[v]]) @ frame
     return out
@@ -68,20 +73,25 @@ def transport(n_from, n_to, X):
     return cosine * X + sine * np.cross(axis, X) + (1 - cosine) * (axis @ X) * axis
 
 
-def divergences(vertices, faces, X, angles=None):
+def divergences(vertices, faces, X, angles=None, at=None):
     """Divergence (V,): the trace of the averaged gradient of the transported components."""
     around = faces_at(faces, len(vertices))
-    normals = [normal(vertices, v, pairs) for v, pairs in enumerate(around)]
-    out = np.zeros(len(vertices))
-    for v, pairs in enumerate(around):
+    out = np.full(len(vertices), np.nan)
+    for v in range(len(vertices)) if at is None else at:
+        pairs = around[v]
+        normals = {k: normal(vertices, k, around[k]) for k in {v}.union(*pairs)}
         frame = basis(normals[v], 0.0 if angles is None else angles[v])
         here = frame @ X[v]
+        out[v] = 0
         for i, j, corners, weight in lifted_faces(vertices, v, pairs, frame):
             there = np.array([frame @ transport(normals[k], normals[v], X[k]) - here for k in (i, j)])
             out[v] += weight * np.trace(np.linalg.solve(corners, there))
     return out
 
 
-def laplacians(vertices, faces, u, angles=None):
+def laplacians(vertices, faces, u, angles=None, at=None):
     """Laplacian (V,): the divergence of the gradient."""
-    return divergences(vertices, faces, gradients(vertices, faces, u, angles), angles)
+    at = range(len(vertices)) if at is None else at
+    around = faces_at(faces, len(vertices))
+    nearby = {int(k) for v in at for k in {v}.union(*around[v])}
+    return divergences(vertices, faces, gradients(vertices, faces, u, angles, nearby), angles, at)

@@ -51,7 +51,7 @@ class Picture:
 
     def _compose(self, plotter_class: Any, limits: tuple[float, float], colormap: str) -> Any:
         plotter = plotter_class(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
-        bar = dict(color="black", vertical=True, fmt="%.3g", position_x=0.84, position_y=0.2, height=0.6)
+        bar = dict(color="black", fmt="%.3g", n_labels=2, position_x=0.3, position_y=0.02, width=0.65, height=0.08)
         for column, view in enumerate(_VIEWS):
             plotter.subplot(0, column)
             plotter.set_background("white")
@@ -67,7 +67,7 @@ class Picture:
                 scalar_bar_args=dict(title=self._title, **bar),
             )
             plotter.view_vector(view, viewup=(0, 1, 0))
-            plotter.camera.zoom(1.25)
+            plotter.camera.zoom(1.1)
         plotter.subplot(0, 0)
         return plotter
 

@@ -1,0 +1,83 @@
+"""As long as a mesh is accepted, everything computed on it is finite and no Laplacian weight is negative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mesh_files import WRITERS, damaged
+
+import ltljax as ltl
+
+SCHEMES = [ltl.Paper(), ltl.Monotone(), ltl.Monotone(lift="projection")]
+
+
+def assert_sound(mesh, dtype=jnp.float64):
+    for scheme in SCHEMES:
+        surface = ltl.Surface.from_mesh(mesh, scheme, dtype)
+        assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(surface.geometry))
+        assert all((np.asarray(w) >= 0).all() for w in surface.geometry.laplacian_weights or ())
+        np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1, rtol=1e-5)
+
+
+def test_damaged_files_that_are_accepted_give_finite_operators(tmp_path):
+    random = np.random.default_rng(11)
+    shapes = [ltl.shapes.jittered_sphere(1, 0.3, seed=0), ltl.shapes.disk(rings=3)]
+    good = [(ending, write(s.vertices, s.faces)) for s in shapes for ending, write in WRITERS.values()]
+    accepted = 0
+    for index in range(200):
+        ending, data = good[index % len(good)]
+        path = tmp_path / f"damaged{index}.{ending}"
+        path.write_bytes(damaged(data, random))
+        try:
+            mesh = ltl.load_mesh(path, repair=index % 3 == 0)
+        except ltl.MeshError:
+            continue
+        accepted += 1
+        assert_sound(mesh)
+    assert accepted > 10
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_crumpled_spheres_give_finite_operators(seed):
+    random = np.random.default_rng(seed)
+    sphere = ltl.shapes.icosphere(2)
+    scale = 10.0 ** random.uniform(-2, 1)
+    vertices = sphere.vertices + scale * random.normal(size=sphere.vertices.shape)
+    try:
+        mesh = ltl.Mesh(vertices, sphere.faces)
+    except ltl.MeshError:
+        return
+    assert_sound(mesh)
+
+
+@pytest.mark.parametrize(("height", "inconsistent"), [(0.0, False), (-0.99, True)])
+def test_a_pit_is_counted_and_stays_stable(height, inconsistent):
+    sphere = ltl.shapes.icosphere(2)
+    vertices = sphere.vertices.copy()
+    vertices[0] *= 1 + height
+    surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, sphere.faces))
+    assert (len(surface.report.inconsistent) > 0) == inconsistent
+    assert ("worst moment residual" in str(surface.report)) == inconsistent
+    eigenvalues = np.linalg.eigvals(ltl.laplacian_matrix(surface).todense())
+    assert eigenvalues.real.max() < 1e-10 * np.abs(eigenvalues).max()
+
+
+@pytest.mark.parametrize("factor", [1e-8, 1e8])
+def test_scale_is_of_no_account(factor):
+    mesh = ltl.shapes.jittered_sphere(2, 0.3, seed=1)
+    small = ltl.Surface.from_mesh(mesh.scaled(factor))
+    u = mesh.vertices[:, 0]
+    expected = ltl.laplacian(ltl.Surface.from_mesh(mesh), u)
+    np.testing.assert_allclose(ltl.laplacian(small, u) * factor**2, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_a_mesh_too_small_for_float32_is_refused_with_a_cure():
+    mesh = ltl.shapes.icosphere(1).scaled(1e-25)
+    assert_sound(mesh)
+    with pytest.raises(ValueError, match=r"leave the range of float32\. Rescale"):
+        ltl.Surface.from_mesh(mesh, dtype=jnp.float32)
+
+
+@pytest.mark.parametrize("name", ["stanford_bunny.obj", "hand_open.obj", "spot_low.obj"])
+def test_real_meshes_are_sound(name, real_mesh):
+    assert_sound(ltl.load_mesh(real_mesh(name)))
