@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import paper_reference
@@ -57,15 +58,10 @@ def test_operators_equal_the_papers_formulas(name, real_mesh):
     gradients = paper_reference.gradients(u=u, **arguments)[at]
     assert relative_difference(ltl.gradient(surface, u)[at], gradients) < 1e-12
     # X is not tangent: its normal part has no divergence in either.
-    divergences = paper_reference.divergences(X=tangent(surface, X), **arguments)[at]
+    divergences = paper_reference.divergences(X=X, **arguments)[at]
     assert relative_difference(ltl.divergence(surface, X)[at], divergences) < 1e-12
     laplacians = paper_reference.laplacians(u=u, **arguments)[at]
     assert relative_difference(ltl.laplacian(surface, u)[at], laplacians) < 1e-12
-
-
-def tangent(surface, X):
-    normals = np.asarray(surface.normals)
-    return X - np.sum(X * normals, axis=1, keepdims=True) * normals
 
 
 @pytest.mark.parametrize("name", ["jittered torus", "hand_open.obj"])
@@ -73,15 +69,17 @@ def test_comparisons_meet_the_interior_and_the_boundary(name, real_mesh):
     mesh = mesh_named(name, real_mesh)
     met = mesh.boundary_vertices[vertices_to_compare(mesh)]
     assert (~met).sum() >= 288
-    assert met.sum() == (min(SAMPLES, mesh.boundary_vertices.sum()))
+    assert met.sum() == min(SAMPLES, mesh.boundary_vertices.sum())
 
 
 def with_turned_frames(surface, angles):
-    e1, e2 = np.moveaxis(np.asarray(surface.geometry.frames), 1, 0)
+    # In NumPy, as surfaces are built, so that nothing has to be compiled.
+    topology, geometry = jax.tree.map(np.asarray, (surface.topology, surface.geometry))
+    e1, e2 = np.moveaxis(geometry.frames, 1, 0)
     cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    frames = jnp.asarray(np.stack([cosine * e1 + sine * e2, cosine * e2 - sine * e1], axis=1))
-    geometry = weigh_in_frames(surface.scheme, surface.vertices, surface.topology, surface.normals, frames)
-    return dataclasses.replace(surface, geometry=geometry)
+    frames = np.stack([cosine * e1 + sine * e2, cosine * e2 - sine * e1], axis=1)
+    geometry = weigh_in_frames(surface.scheme, geometry.vertices, topology, geometry.normals, frames)
+    return dataclasses.replace(surface, geometry=jax.tree.map(jnp.asarray, geometry))
 
 
 @pytest.mark.parametrize("name", ["jittered sphere", "jittered torus"])
@@ -108,9 +106,20 @@ def test_the_transcription_does_not_depend_on_the_tangent_bases():
 PUBLISHED = {2: (1.43e-1, 4.66e-2), 3: (3.91e-2, 1.21e-2), 4: (1.14e-2, 3.16e-3), 5: (4.78e-3, 8.45e-4)}
 
 
+def published_icosphere(subdivisions):
+    """The icosphere with the middle of an edge at the pole, as in icosahedra with corners (0, +-1, +-golden ratio).
+
+    The published errors are those of a function that is not the same in all directions: elsewhere they differ by 2 %.
+    """
+    mesh = ltl.shapes.icosphere(subdivisions)
+    angle = np.arctan(2) / 2
+    about_y = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+    return ltl.Mesh(mesh.vertices @ about_y.T, mesh.faces)
+
+
 @pytest.mark.parametrize("subdivisions", PUBLISHED)
 def test_errors_on_icospheres_are_the_published_ones(subdivisions):
-    mesh = ltl.shapes.icosphere(subdivisions)
+    mesh = published_icosphere(subdivisions)
     surface = ltl.Surface.from_mesh(mesh, ltl.Paper())
     x, y, z = mesh.vertices.T
     u = x * y * z + (x**2 - y**2) / 2
@@ -119,7 +128,7 @@ def test_errors_on_icospheres_are_the_published_ones(subdivisions):
     exact_gradient = in_space - np.sum(in_space * mesh.vertices, axis=1, keepdims=True) * mesh.vertices
     laplacian_error = rms(ltl.laplacian(surface, u) - exact_laplacian) / rms(exact_laplacian)
     gradient_error = rms(np.linalg.norm(ltl.gradient(surface, u) - exact_gradient, axis=1))
-    np.testing.assert_allclose([laplacian_error, gradient_error], PUBLISHED[subdivisions], rtol=0.01)
+    np.testing.assert_allclose([laplacian_error, gradient_error], PUBLISHED[subdivisions], rtol=0.005)
 
 
 def rms(values):

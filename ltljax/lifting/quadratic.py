@@ -26,15 +26,16 @@ def laplacian_weights(
     is then exact for fields whose normal derivative vanishes (homogeneous Neumann); a flux q adds -q sum c y.
 
     Rounding below zero is cut off. On a support where the fit is negative, or has no solution, the cut makes the row
-    inconsistent, and the residual says so: it is relative to the right side, zero to rounding where the row is exact.
+    inconsistent, and the residual says so: half the largest error of a moment, zero to rounding where a row is exact.
     Pointwise first order on irregular meshes, second where rings are symmetric; second order in solved problems.
     """
     xp = lifted.__array_namespace__()
     moments, weights, scale = ring_moments(lifted, is_boundary)
     target = xp.array([0, 0, 0, 2, 2], lifted.dtype)
-    c = xp.maximum(_least_norm(moments, weights, target), 0)
-    residual = xp.linalg.norm(target[:, None] - _apply_moments(moments, c), axis=0) / xp.linalg.norm(target)
-    return c / scale[None] ** 2, residual
+    c = xp.maximum(_least_norm(moments, weights, target[None]), 0)
+    error = target[:, None] - _apply_moments(moments, c)[0]
+    residual = xp.max(xp.abs(error), axis=0) / 2
+    return c[0] / scale[None] ** 2, residual
 
 
 def gradient_weights(lifted: Float[AnyArray, "K N 2"]) -> Float[AnyArray, "K N 2"]:
@@ -44,8 +45,8 @@ def gradient_weights(lifted: Float[AnyArray, "K N 2"]) -> Float[AnyArray, "K N 2
     """
     xp = lifted.__array_namespace__()
     moments, weights, scale = ring_moments(lifted, xp.zeros(lifted.shape[1], bool))
-    along_x, along_y = (_least_norm(moments, weights, target) for target in xp.eye(2, 5, dtype=lifted.dtype))
-    return xp.stack([along_x, along_y], axis=-1) / scale[None, :, None]
+    rows = _least_norm(moments, weights, xp.eye(2, 5, dtype=lifted.dtype))
+    return xp.moveaxis(rows, 0, -1) / scale[None, :, None]
 
 
 def refined_normals(offsets: Float[AnyArray, "K N 3"], normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 3"]:
@@ -78,7 +79,7 @@ def ring_moments(
 
 
 def _apply_moments(moments, c):
-    return moments.__array_namespace__().einsum("ikn,kn->in", moments, c)
+    return moments.__array_namespace__().einsum("ikn,rkn->rin", moments, c)
 
 
 def moment_matrix(moments: Float[AnyArray, "5 K N"], weights: Float[AnyArray, "K N"]) -> Float[AnyArray, "5 5 N"]:
@@ -86,7 +87,9 @@ def moment_matrix(moments: Float[AnyArray, "5 K N"], weights: Float[AnyArray, "K
     return moments.__array_namespace__().einsum("ikn,jkn->ijn", moments * weights[None], moments)
 
 
-def _least_norm(moments, weights, target):
+def _least_norm(
+    moments: Float[AnyArray, "5 K N"], weights: Float[AnyArray, "K N"], targets: Float[AnyArray, "R 5"]
+) -> Float[AnyArray, "R K N"]:
     """c = W A^T (A W A^T)^-1 b by a ridge and refinement, so that a matrix without full rank is no special case."""
     xp = moments.__array_namespace__()
     matrix = moment_matrix(moments, weights)
@@ -94,39 +97,40 @@ def _least_norm(moments, weights, target):
     # Small enough for the refinement to restore full accuracy, large enough that a matrix without full rank (four
     # neighbours, a mirrored ring) does not magnify rounding.
     ridge = xp.where(trace > 0, xp.finfo(matrix.dtype).eps ** (2 / 3) * trace / 5, 1)
-    factor = _cholesky(matrix + ridge[None, None] * xp.eye(5, dtype=matrix.dtype)[:, :, None])
-    c = xp.zeros_like(weights)
+    identity = xp.eye(5, dtype=matrix.dtype)[:, :, None]
+    inverse = _inverse(matrix + ridge[None, None] * identity)
+    weighted = moments * weights[None]
+    c = xp.zeros((targets.shape[0], *weights.shape), dtype=weights.dtype)
     for _ in range(1 + _REFINEMENTS):
-        multiplier = _substitute(factor, target[:, None] - _apply_moments(moments, c))
-        c = c + weights * xp.einsum("ikn,in->kn", moments, multiplier)
+        multipliers = xp.einsum("ijn,rjn->rin", inverse, targets[:, :, None] - _apply_moments(moments, c))
+        c = c + xp.einsum("ikn,rin->rkn", weighted, multipliers)
     return c
 
 
-# Five unknowns for every vertex at once: written out over rows of length N they fuse, where a batched factorisation
-# would call LAPACK once a vertex.
+def _inverse(matrix: Float[AnyArray, "M M N"]) -> Float[AnyArray, "M M N"]:
+    """The inverses of symmetric positive definite matrices, by Cholesky.
 
-
-def _cholesky(matrix: Float[AnyArray, "M M N"]) -> list[list[AnyArray]]:
+    Five unknowns for every vertex at once: written out over rows of length N it fuses, where a batched factorisation
+    would call LAPACK once a vertex.
+    """
     xp = matrix.__array_namespace__()
+    size = matrix.shape[0]
     factor: list[list[AnyArray]] = []
-    for i in range(matrix.shape[0]):
+    for i in range(size):
         row: list[AnyArray] = []
         for j in range(i):
-            row.append((matrix[i, j] - _dot(row[:j], factor[j][:j])) / factor[j][j])
+            row.append((matrix[i, j] - _dot(row, factor[j][:j])) / factor[j][j])
         factor.append([*row, xp.sqrt(matrix[i, i] - _dot(row, row))])
-    return factor
+    # The inverse of the factor, column by column; the columns' upper parts are zero.
+    columns = []
+    for j in range(size):
+        column = [1 / factor[j][j]]
+        for i in range(j + 1, size):
+            column.append(-_dot(factor[i][j:i], column) / factor[i][i])
+        columns.append(xp.stack([xp.zeros_like(matrix[0, 0])] * j + column))
+    inverse_factor = xp.stack(columns)
+    return xp.einsum("imn,jmn->ijn", inverse_factor, inverse_factor)
 
 
-def _substitute(factor: list[list[AnyArray]], right: Float[AnyArray, "M N"]) -> Float[AnyArray, "M N"]:
-    size = len(factor)
-    forward: list[AnyArray] = []
-    for i in range(size):
-        forward.append((right[i] - _dot(factor[i][:i], forward)) / factor[i][i])
-    back: list[AnyArray] = []
-    for i in reversed(range(size)):
-        back.insert(0, (forward[i] - _dot([factor[j][i] for j in range(i + 1, size)], back)) / factor[i][i])
-    return right.__array_namespace__().stack(back)
-
-
-def _dot(left: list[AnyArray], right: list[AnyArray]) -> AnyArray | float:
+def _dot(left: list[AnyArray], right: list[AnyArray]) -> AnyArray:
     return sum((a * b for a, b in zip(left, right, strict=True)), 0.0)

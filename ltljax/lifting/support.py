@@ -153,10 +153,10 @@ def _nonnegative_row(lifted: np.ndarray, is_boundary: bool) -> tuple[np.ndarray,
         moments, weights, _ = ring_moments(lifted[picked][:, None], np.array([is_boundary]))
         columns = weights[:, 0] ** 2
         try:
-            c, distance = nnls(moments[:, :, 0] * columns, target)
+            c, _ = nnls(moments[:, :, 0] * columns, target)
         except RuntimeError:  # no convergence: the candidates as they are cannot be worse than nothing
             return picked[:0], found
-        found = float(distance / np.linalg.norm(target))
+        found = float(np.abs(moments[:, :, 0] @ (columns * c) - target).max() / 2)
         if np.all(c > 0):
             break
         picked = picked[c > 0]
