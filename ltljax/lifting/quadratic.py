@@ -132,5 +132,5 @@ def _inverse(matrix: Float[AnyArray, "M M N"]) -> Float[AnyArray, "M M N"]:
     return xp.einsum("imn,jmn->ijn", inverse_factor, inverse_factor)
 
 
-def _dot(left: list[AnyArray], right: list[AnyArray]) -> AnyArray:
+def _dot(left: list[AnyArray], right: list[AnyArray]) -> AnyArray | float:
     return sum((a * b for a, b in zip(left, right, strict=True)), 0.0)
