@@ -66,7 +66,7 @@ def run(example: Scenario, options: Options, *, scheme: str, dtype: str, frames:
     print(f"{example.name} on {options.mesh}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, scheme {scheme}")
     for note in example.notes:
         print(f"note: {note}")
-    if surface.report.inconsistent is not None and len(surface.report.inconsistent):
+    if len(surface.report.inconsistent):
         print(
             f"note: {len(surface.report.inconsistent)} vertices have no consistent non-negative row; diffusion is "
             "stable there, but not accurate."

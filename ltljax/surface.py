@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .lifting import support
 from .lifting.frames import tangent_frames
+from .lifting.paper import dropped_faces
 from .lifting.ring import RingTopology, lifted_ring
 from .lifting.schemes import (
     Geometry,
@@ -37,16 +38,20 @@ class SurfaceReport:
     """What the construction of a surface found.
 
     Attributes:
-        wide_gradient_rows: vertices whose one-ring does not determine a quadratic, so the gradient uses wider rings.
-        rings: (V,) number of rings each Laplacian row was chosen from; None for a scheme without a choice.
-        residual: (V,) relative moment residual of each Laplacian row.
+        dropped_faces: (V,) of `Paper`: faces at each vertex that its lift makes degenerate, which have no part in the
+            mean; else None.
+        wide_gradient_rows: of `Monotone`: vertices whose one-ring does not determine a quadratic, so that the gradient
+            uses wider rings; else None.
+        rings: (V,) of `Monotone`: number of rings each Laplacian row was chosen from; else None.
+        residual: (V,) of `Monotone`: relative moment residual of each Laplacian row; else None.
         inconsistent: vertices without a consistent non-negative row. Diffusion is stable there, but not accurate.
     """
 
-    wide_gradient_rows: np.ndarray
+    dropped_faces: np.ndarray | None = None
+    wide_gradient_rows: np.ndarray | None = None
     rings: np.ndarray | None = None
     residual: np.ndarray | None = None
-    inconsistent: np.ndarray | None = None
+    inconsistent: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
 
     # A report decides no computation, so surfaces that differ only in it share compiled code.
     def __eq__(self, other):
@@ -56,15 +61,19 @@ class SurfaceReport:
         return hash(SurfaceReport)
 
     def __str__(self):
-        lines = [f"gradient rows wider than one ring   {len(self.wide_gradient_rows)}"]
-        if self.rings is not None and self.residual is not None and self.inconsistent is not None:
+        lines = []
+        if self.dropped_faces is not None:
+            lines.append(("degenerate lifted faces", f"{self.dropped_faces.sum()}"))
+        if self.wide_gradient_rows is not None:
+            lines.append(("gradient rows wider than one ring", f"{len(self.wide_gradient_rows)}"))
+        if self.rings is not None and self.residual is not None:
             lines += [
-                f"Laplacian rows from {n} ring{'s' * (n > 1)}         {np.sum(self.rings == n)}" for n in (1, 2, 3)
+                (f"Laplacian rows chosen from {n} ring{'s' * (n > 1)}", f"{np.sum(self.rings == n)}") for n in (1, 2, 3)
             ]
-            lines.append(f"inconsistent Laplacian rows         {len(self.inconsistent)}")
+            lines.append(("inconsistent Laplacian rows", f"{len(self.inconsistent)}"))
             if len(self.inconsistent):
-                lines.append(f"worst moment residual               {self.residual.max():.2g}")
-        return "\n".join(lines)
+                lines.append(("worst moment residual", f"{self.residual.max():.2g}"))
+        return "\n".join(f"{name:<36}{value}" for name, value in lines)
 
 
 class Surface(eqx.Module):
@@ -193,7 +202,15 @@ def _freeze(mesh: Mesh, scheme: Scheme) -> tuple[Topology, SurfaceReport]:
         diffusion=None,
     )
     if isinstance(scheme, Paper):
-        return topology, SurfaceReport(wide_gradient_rows=np.zeros(0, np.int64))
+        frames = tangent_frames(ring_normals(mesh.vertices, ring, topology.ring_blocks))
+        return topology, SurfaceReport(
+            dropped_faces=ring.map(
+                lambda block, rings: dropped_faces(
+                    lifted_ring(offsets(mesh.vertices, block), block.centre(frames), scheme.lift), rings
+                ),
+                topology.ring_blocks,
+            )
+        )
     return _choose_support(mesh, rings, topology, scheme)
 
 

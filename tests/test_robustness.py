@@ -7,6 +7,8 @@ import pytest
 from mesh_files import WRITERS, damaged
 
 import ltljax as ltl
+from ltljax.lifting import paper
+from ltljax.lifting.ring import RingTopology
 
 SCHEMES = [ltl.Paper(), ltl.Monotone(), ltl.Monotone(lift="projection")]
 
@@ -81,3 +83,16 @@ def test_a_mesh_too_small_for_float32_is_refused_with_a_cure():
 @pytest.mark.parametrize("name", ["stanford_bunny.obj", "hand_open.obj", "spot_low.obj"])
 def test_real_meshes_are_sound(name, real_mesh):
     assert_sound(ltl.load_mesh(real_mesh(name)))
+
+
+def test_faces_that_the_lift_makes_degenerate_are_dropped_and_counted():
+    topology = RingTopology(valences=np.array([4]), is_boundary=np.array([False]))
+    # The first face is a line; the second has its centroid at the vertex once its corners are opposite.
+    for ring, count in (([(1, 0), (2, 0), (0, 1), (-1, -1)], 1), ([(1, 0), (-1, 0), (-1, -1), (0, -1)], 1)):
+        lifted = np.array(ring, float)[:, None]
+        assert paper.dropped_faces(lifted, topology) == count
+        weights = paper.gradient_weights(lifted, topology)
+        linear = lifted @ np.array([2.0, -3.0])
+        np.testing.assert_allclose(np.einsum("kna,kn->na", weights, linear), [[2, -3]], atol=1e-14)
+    report = ltl.Surface.from_mesh(ltl.shapes.icosphere(1), ltl.Paper()).report
+    assert str(report).split() == ["degenerate", "lifted", "faces", "0"]

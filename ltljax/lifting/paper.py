@@ -3,7 +3,7 @@
 Source: Chen, Chi and Wu, A new intrinsic numerical method for PDE on surfaces, arXiv 0907.1817, sections 2.2 to 2.4.
 """
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from ..tables import AnyArray
 from .ring import DEGENERATE, RingTopology, take_slots
@@ -20,11 +20,7 @@ def gradient_weights(lifted: Float[AnyArray, "K N 2"], topology: RingTopology) -
     xp = lifted.__array_namespace__()
     num_slots = lifted.shape[0]
     a, b = lifted, take_slots(lifted, topology.following(num_slots))
-    determinant = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    squared_edges = xp.sum(a**2, axis=-1) * xp.sum(b**2, axis=-1)
-    squared_centroid = xp.sum((a + b) ** 2, axis=-1) / 9
-    has_face = determinant**2 > DEGENERATE**2 * squared_edges
-    has_face &= squared_centroid > DEGENERATE**2 * xp.sum(a**2 + b**2, axis=-1)
+    determinant, squared_centroid, has_face = _lifted_faces(a, b)
     centroid_weight = xp.where(has_face, 1 / xp.where(has_face, squared_centroid, 1), 0)
     total = xp.sum(centroid_weight, axis=0)
     face_weight = centroid_weight / xp.where(total > 0, total, 1)[None] / xp.where(has_face, determinant, 1)
@@ -32,3 +28,24 @@ def gradient_weights(lifted: Float[AnyArray, "K N 2"], topology: RingTopology) -
     to_b = face_weight[..., None] * xp.stack([-a[..., 1], a[..., 0]], axis=-1)
     # Corner b of face k sits in slot k + 1, so a slot collects from its own face and from the one before.
     return to_a + take_slots(to_b, topology.preceding(num_slots))
+
+
+def dropped_faces(lifted: Float[AnyArray, "K N 2"], topology: RingTopology) -> Int[AnyArray, " N"]:
+    """How many faces of each ring have no part in the mean because their lift is degenerate."""
+    xp = lifted.__array_namespace__()
+    _, _, has_face = _lifted_faces(lifted, take_slots(lifted, topology.following(lifted.shape[0])))
+    num_faces = xp.where(topology.is_boundary, topology.valences - 1, topology.valences).clip(0)
+    return num_faces - xp.sum(has_face, axis=0)
+
+
+def _lifted_faces(
+    a: Float[AnyArray, "K N 2"], b: Float[AnyArray, "K N 2"]
+) -> tuple[Float[AnyArray, "K N"], Float[AnyArray, "K N"], Bool[AnyArray, "K N"]]:
+    """Twice the signed area of the lifted faces (0, a, b), the squared distance of their centroids, and which count."""
+    xp = a.__array_namespace__()
+    determinant = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    squared_edges = xp.sum(a**2, axis=-1) * xp.sum(b**2, axis=-1)
+    squared_centroid = xp.sum((a + b) ** 2, axis=-1) / 9
+    has_face = determinant**2 > DEGENERATE**2 * squared_edges
+    has_face &= squared_centroid > DEGENERATE**2 * xp.sum(a**2 + b**2, axis=-1)
+    return determinant, squared_centroid, has_face
