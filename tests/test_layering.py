@@ -1,0 +1,70 @@
+"""The arrows between the rooms point one way, and what computes does not load what draws."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "ltljax"
+
+# Each room, and the rooms of the package it may import.
+MAY_IMPORT = {
+    "mesh": set(),
+    "tables": set(),
+    "lifting": {"tables"},
+    "surface": {"mesh", "lifting", "tables"},
+    "operators": {"surface", "tables"},
+    "equations": {"operators", "surface", "tables"},
+    "solve": {"equations", "operators", "surface", "tables", "lifting"},
+    "output": set(),
+    "scenario": {"mesh", "equations", "operators", "surface", "solve"},
+    "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output"},
+    "cli": {"scenario", "run", "mesh", "solve"},
+}
+NO_JAX = ["mesh", "output", "lifting/support.py"]
+
+
+def files(room):
+    folder = PACKAGE / room
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else [PACKAGE / f"{room}.py"]
+
+
+def imported(path):
+    """What a file imports: full names, relative ones resolved."""
+    parts = ["ltljax", *path.relative_to(PACKAGE).with_suffix("").parts]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = parts[: -node.level] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield module
+            yield from (f"{module}.{name.name}" for name in node.names)
+
+
+def test_every_file_belongs_to_a_room_of_the_table():
+    rooms = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in PACKAGE.rglob("*.py")}
+    assert rooms - {"__init__"} == set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_a_room_imports_only_the_rooms_before_it(room):
+    for path in files(room):
+        for name in imported(path):
+            if name.startswith("ltljax."):
+                other = name.split(".")[1]
+                assert other == room or other in MAY_IMPORT[room], f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("room", NO_JAX)
+def test_host_rooms_do_without_jax(room):
+    for path in [PACKAGE / room] if room.endswith(".py") else files(room):
+        assert not {"jax", "equinox", "diffrax"} & {name.split(".")[0] for name in imported(path)}, path.name
+
+
+def test_importing_the_package_loads_no_extra():
+    code = "import sys, ltljax; print(*{'pyvista', 'vtkmodules', 'meshio', 'nibabel', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
