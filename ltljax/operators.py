@@ -39,7 +39,7 @@ def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S
 
 
 @eqx.filter_jit
-def divergence(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S"]:
+def divergence(surface: Surface, X: Float[AnyArray, "V *C"]) -> Float[Array, "V *S"]:
     """The surface divergence of a tangent vector field, positive where the field spreads out.
 
     The neighbours' vectors are transported into the vertex's tangent plane and differentiated there with the weights
