@@ -135,7 +135,9 @@ class Surface(eqx.Module):
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")
-        geometry = _cast(_weigh(self.scheme, jnp.asarray(vertices), self.topology), self.dtype)
+        # In the widest float that JAX has switched on, and cast last.
+        vertices = jnp.asarray(vertices, _float_dtype(None))
+        geometry = _cast(_weigh(self.scheme, vertices, self.topology), self.dtype)
         return eqx.tree_at(lambda surface: surface.geometry, self, geometry)
 
     @property
