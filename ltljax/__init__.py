@@ -11,11 +11,11 @@ equations are made of operators; `solve` carries them through time.
 from importlib.metadata import version as _version
 
 from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
-from .lifting.schemes import Monotone, Paper
+from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
 from .operators import divergence, gradient, integrate, laplacian, laplacian_matrix
 from .solve import RKC2, Solution, SolveError, solve
-from .surface import Surface
+from .surface import InconsistentRowsWarning, Surface
 
 __version__ = _version("ltljax")
 
@@ -23,10 +23,12 @@ __all__ = [
     "RKC2",
     "Diffusion",
     "Equation",
+    "InconsistentRowsWarning",
     "Mesh",
     "MeshError",
     "Monotone",
     "Paper",
+    "Polynomial",
     "ReactionDiffusion",
     "Solution",
     "SolveError",

@@ -7,9 +7,8 @@ import dataclasses
 import itertools
 import json
 import platform
-import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,14 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .lifting.schemes import Monotone, Paper
+from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh
 from .operators import integrate
+from .progress import watched
 from .scenario import Options, Scenario
 from .solve import SolveError, solve
 from .surface import Surface
 
-_SCHEMES = {"monotone": Monotone(), "paper": Paper()}
+_SCHEMES = {"monotone": Monotone(), "polynomial": Polynomial(), "paper": Paper()}
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
 _RTOL, _ATOL = 1e-4, 1e-6
 
@@ -117,7 +117,7 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
     # From a time to itself: nothing to step, everything to compile.
     jax.block_until_ready(solve(equation, surface, u, 0.0, t0=0.0, throw=False, rtol=_RTOL, atol=_ATOL).us)
     reached.compile_seconds = time.perf_counter() - start
-    for t0, t1 in _with_progress(list(itertools.pairwise(times.tolist()))):
+    for t0, t1 in watched("time", unit="frame")(list(itertools.pairwise(times.tolist()))):
         start = time.perf_counter()
         solution = solve(equation, surface, u, t1, t0=t0, throw=False, rtol=_RTOL, atol=_ATOL)
         u = jax.block_until_ready(solution.u_end)
@@ -127,24 +127,6 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
         reached.times.append(float(solution.t_end))
         reached.states.append(np.asarray(u))
         solution.check(surface)
-
-
-def _with_progress(steps: list[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    try:
-        from tqdm import tqdm  # in the extra `app`
-    except ImportError:
-        yield from _with_plain_progress(steps)
-        return
-    yield from tqdm(steps, desc="time", unit="frame", dynamic_ncols=True)
-
-
-def _with_plain_progress(steps: list[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    start = time.perf_counter()
-    for done, step in enumerate(steps):
-        if done and done % max(1, len(steps) // 10) == 0:
-            left = (time.perf_counter() - start) / done * (len(steps) - done)
-            print(f"t = {step[0]:.4g} ({100 * done // len(steps)} %), about {left:.0f} s left", file=sys.stderr)
-        yield step
 
 
 def _measure(example: Scenario, surface: Surface, reached: _Progress) -> dict[str, Any]:

@@ -5,6 +5,9 @@ everything is a pure function of them.
 """
 
 import dataclasses
+import functools
+import warnings
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,12 +17,14 @@ from jaxtyping import Array, Float, Int
 
 from .lifting import support
 from .lifting.frames import tangent_frames
+from .lifting.jets import INTERIOR, LAPLACIAN, OTHER_CORNER, RIGHT_CORNER, SMOOTH
 from .lifting.paper import dropped_faces
 from .lifting.ring import RingTopology, lifted_ring
 from .lifting.schemes import (
     Geometry,
     Monotone,
     Paper,
+    Polynomial,
     Scheme,
     Topology,
     diffusion_rows,
@@ -30,7 +35,16 @@ from .lifting.schemes import (
     weigh,
 )
 from .mesh import Mesh, OneRings, k_ring, one_rings
+from .progress import watched
 from .tables import AnyArray, Table, build_table
+
+# A boundary that turns by more than this many degrees at a vertex has a corner there, and within so many degrees of a
+# right angle it counts as one.
+_CORNER, _RIGHT = 40, 20
+
+
+class InconsistentRowsWarning(UserWarning):
+    """Some vertices have no consistent row of non-negative weights, so that diffusion is not accurate there."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,8 +54,8 @@ class SurfaceReport:
     Attributes:
         dropped_faces: (V,) of `Paper`: faces at each vertex that its lift makes degenerate, which have no part in the
             mean; else None.
-        wide_gradient_rows: of `Monotone`: vertices whose one-ring does not determine a quadratic, so that the gradient
-            uses wider rings; else None.
+        wide_gradient_rows: vertices whose one-ring (of `Polynomial`: whose nearest neighbours) does not determine the
+            fit, so that the gradient uses more; None of `Paper`.
         rings: (V,) of `Monotone`: number of rings each Laplacian row was chosen from; else None.
         residual: (V,) of `Monotone`: relative moment residual of each Laplacian row; else None.
         inconsistent: vertices without a consistent non-negative row. Diffusion is stable there, but not accurate.
@@ -65,7 +79,7 @@ class SurfaceReport:
         if self.dropped_faces is not None:
             lines.append(("degenerate lifted faces", f"{self.dropped_faces.sum()}"))
         if self.wide_gradient_rows is not None:
-            lines.append(("gradient rows wider than one ring", f"{len(self.wide_gradient_rows)}"))
+            lines.append(("gradient rows wider than usual", f"{len(self.wide_gradient_rows)}"))
         if self.rings is not None and self.residual is not None:
             lines += [
                 (f"Laplacian rows chosen from {n} ring{'s' * (n > 1)}", f"{np.sum(self.rings == n)}") for n in (1, 2, 3)
@@ -82,7 +96,7 @@ class Surface(eqx.Module):
     Attributes:
         topology: the tables that stay when vertices move.
         geometry: the arrays that depend on the positions.
-        scheme: `Monotone` or `Paper`.
+        scheme: `Monotone`, `Polynomial` or `Paper`.
         report: what the construction found (host).
     """
 
@@ -92,20 +106,26 @@ class Surface(eqx.Module):
     report: SurfaceReport = eqx.field(static=True)
 
     @classmethod
-    def from_mesh(cls, mesh: Mesh, scheme: Scheme | None = None, dtype=None) -> "Surface":
+    def from_mesh(
+        cls, mesh: Mesh, scheme: Scheme | None = None, dtype=None, progress: bool = False
+    ) -> "Surface":
         """The surface of a mesh.
 
         Weights are computed in float64 and cast last.
 
         Args:
             mesh: the mesh.
-            scheme: `Monotone()` (the default) or `Paper()`.
+            scheme: `Monotone()` (the default), `Polynomial()` or `Paper()`.
             dtype: float32 or float64; by default JAX's own default float.
+            progress: whether to show how far the choice of neighbours is; it takes seconds for 100,000 vertices.
 
         Raises:
             TypeError: no mesh was given.
             ValueError: the dtype is no float, or is float64 while JAX has 64-bit numbers switched off, or the mesh is
                 so small that its weights leave the range of the dtype.
+
+        Warns:
+            InconsistentRowsWarning: `Monotone` found no consistent non-negative row at some vertices.
         """
         if not isinstance(mesh, Mesh):
             raise TypeError(
@@ -115,17 +135,18 @@ class Surface(eqx.Module):
         if not isinstance(scheme, Scheme):
             raise TypeError(f"Expected a scheme such as ltl.Monotone() or ltl.Paper(), found {scheme!r}.")
         dtype = _float_dtype(dtype)
-        topology, report = _freeze(mesh, scheme)
+        topology, report = _freeze(mesh, scheme, functools.partial(watched, progress=progress))
         # On the host in NumPy, where float64 is always at hand and nothing has to be compiled for the mesh's size.
         with np.errstate(over="ignore"):  # an overflow of the cast is found below
-            geometry = _cast(weigh(scheme, mesh.vertices, topology), dtype)
-        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(geometry)):
+            geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), weigh(scheme, mesh.vertices, topology))
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry)):
             raise ValueError(
                 f"Weights grow like 1 / length^2, and at a mesh size of {mesh.mesh_size:.3g} they leave the range of "
                 f"{jnp.dtype(dtype).name}. Rescale the mesh (mesh.scaled(factor)) or use float64."
             )
-        topology = jax.tree.map(jnp.asarray, topology)
-        return cls(topology, geometry, scheme, report)
+        if len(report.inconsistent):
+            warnings.warn(_inconsistent(report), InconsistentRowsWarning, stacklevel=2)
+        return cls(*jax.tree.map(jnp.asarray, (topology, geometry)), scheme, report)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with its vertices moved and every weight computed anew, on the same support.
@@ -137,7 +158,8 @@ class Surface(eqx.Module):
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")
         # In the widest float that JAX has switched on, and cast last.
         vertices = jnp.asarray(vertices, _float_dtype(None))
-        geometry = _cast(_weigh(self.scheme, vertices, self.topology), self.dtype)
+        geometry = _weigh(self.scheme, vertices, self.topology)
+        geometry = jax.tree.map(lambda leaf: leaf.astype(self.dtype), geometry)
         return eqx.tree_at(lambda surface: surface.geometry, self, geometry)
 
     @property
@@ -174,6 +196,16 @@ class Surface(eqx.Module):
 _weigh = eqx.filter_jit(weigh)
 
 
+def _inconsistent(report: SurfaceReport) -> str:
+    count = len(report.inconsistent)
+    worst = int(np.argmax(np.asarray(report.residual)))
+    return (
+        f"{count} of {len(np.asarray(report.residual))} vertices have no consistent non-negative row, the worst being "
+        f"vertex {worst}. Diffusion stays stable there, but is not accurate. Causes are spikes, folds and slivers: see "
+        "surface.report.inconsistent, and remesh around them."
+    )
+
+
 def _float_dtype(dtype):
     if dtype is None:
         return jnp.zeros(0).dtype
@@ -187,24 +219,25 @@ def _float_dtype(dtype):
     return dtype
 
 
-def _cast(geometry: Geometry, dtype) -> Geometry:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), geometry)
-
-
-def _freeze(mesh: Mesh, scheme: Scheme) -> tuple[Topology, SurfaceReport]:
+def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -> tuple[Topology, SurfaceReport]:
     """The topology of a mesh under a scheme, in NumPy: the rings, and the supports chosen from the positions."""
     rings = one_rings(mesh.faces, mesh.num_vertices)
     ring = build_table(rings.offsets, rings.neighbours)
+    ring_blocks = _ring_blocks(ring, rings.valences, mesh.boundary_vertices)
+    normals = ring_normals(mesh.vertices, ring, ring_blocks)
+    loops = mesh.boundary_loops
     topology = Topology(
         faces=mesh.faces.astype(np.int32),
         ring=ring,
-        ring_blocks=_ring_blocks(ring, rings.valences, mesh.boundary_vertices),
-        is_boundary=mesh.boundary_vertices,
+        ring_blocks=ring_blocks,
+        kinds=_kinds(mesh, normals),
+        boundary=np.concatenate([np.zeros(0, np.int32), *loops]),
+        loops=np.repeat(np.arange(len(loops), dtype=np.int32), [len(loop) for loop in loops]),
         jet=ring,
         diffusion=None,
     )
     if isinstance(scheme, Paper):
-        frames = tangent_frames(ring_normals(mesh.vertices, ring, topology.ring_blocks))
+        frames = tangent_frames(normals)
         return topology, SurfaceReport(
             dropped_faces=ring.map(
                 lambda block, rings: dropped_faces(
@@ -213,45 +246,67 @@ def _freeze(mesh: Mesh, scheme: Scheme) -> tuple[Topology, SurfaceReport]:
                 topology.ring_blocks,
             )
         )
-    return _choose_support(mesh, rings, topology, scheme)
+    return _choose_support(mesh, rings, normals, topology, scheme, watch)
 
 
 def _choose_support(
-    mesh: Mesh, rings: OneRings, topology: Topology, scheme: Monotone
+    mesh: Mesh,
+    rings: OneRings,
+    normals: np.ndarray,
+    topology: Topology,
+    scheme: Monotone | Polynomial,
+    watch: Callable[[str], support.Watch],
 ) -> tuple[Topology, SurfaceReport]:
     vertices, rows = mesh.vertices, (rings.offsets, rings.neighbours)
 
     def wider(which: np.ndarray, rings_wide: int) -> support.Rows:
         return k_ring(rings, mesh.num_vertices, which, rings_wide)
 
-    normals = ring_normals(vertices, topology.ring, topology.ring_blocks)
-    frames = tangent_frames(normals)
-    is_well_placed = topology.ring.map(
-        lambda block: support.determines_quadratic(
-            lifted_ring(offsets(vertices, block), block.centre(frames), "projection")
-        )
+    jet_rows, wide = support.fit_support(
+        rows,
+        scheme.degree,
+        wider,
+        support.lift_onto(vertices, tangent_frames(normals), "projection"),
+        watch("choosing the neighbours of the gradient"),
     )
-    lift_at = support.lift_onto(vertices, frames, "projection")
-    topology = dataclasses.replace(
-        topology, jet=build_table(*support.fit_support(rows, is_well_placed, wider, lift_at))
-    )
+    topology = dataclasses.replace(topology, jet=build_table(*jet_rows))
+    if isinstance(scheme, Polynomial):
+        return dataclasses.replace(topology, diffusion=topology.jet), SurfaceReport(wide_gradient_rows=wide)
     # The Laplacian's rows are laid out in the frames they will be weighed in.
-    frames = vertex_frames(vertices, fitted_normals(vertices, normals, topology.jet), topology)
-    _, residual = diffusion_rows(scheme.lift, vertices, frames, topology.is_boundary, topology.ring)
+    normals = fitted_normals(vertices, normals, topology.jet, scheme.degree)
+    frames, _ = vertex_frames(vertices, normals, topology)
+    _, residual, _ = diffusion_rows(scheme, vertices, normals, frames, topology.kinds, topology.ring)
     diffusion, record = support.nonnegative_support(
         rows,
         residual <= support.CONSISTENT,
-        mesh.boundary_vertices,
+        topology.kinds,
+        LAPLACIAN.T,
         wider,
         support.lift_onto(vertices, frames, scheme.lift),
+        watch("choosing the neighbours of the Laplacian"),
     )
     report = SurfaceReport(
-        wide_gradient_rows=np.flatnonzero(~is_well_placed),
-        rings=record.rings,
-        residual=record.residual,
-        inconsistent=record.inconsistent,
+        wide_gradient_rows=wide, rings=record.rings, residual=record.residual, inconsistent=record.inconsistent
     )
     return dataclasses.replace(topology, diffusion=build_table(*diffusion)), report
+
+
+def _kinds(mesh: Mesh, normals: np.ndarray) -> np.ndarray:
+    """Which vertices lie inside, on a smooth boundary, or at a corner of it, (V,) int8."""
+    kinds = np.full(mesh.num_vertices, INTERIOR, np.int8)
+    for loop in mesh.boundary_loops:
+        kinds[loop] = SMOOTH
+        here, frames = mesh.vertices[loop], tangent_frames(normals[loop])
+        to_next = np.einsum("bc,bac->ba", np.roll(here, -1, axis=0) - here, frames)
+        to_previous = np.einsum("bc,bac->ba", np.roll(here, 1, axis=0) - here, frames)
+        # The inner angle: from the next vertex counter-clockwise, over the surface, to the previous one.
+        turn = np.arctan2(to_previous[:, 1], to_previous[:, 0]) - np.arctan2(to_next[:, 1], to_next[:, 0])
+        angle = np.degrees(turn) % 360
+        is_corner = np.abs(angle - 180) > _CORNER
+        is_right = np.abs(np.abs(angle - 180) - 90) < _RIGHT
+        kinds[loop[is_corner]] = OTHER_CORNER
+        kinds[loop[is_corner & is_right]] = RIGHT_CORNER
+    return kinds
 
 
 def _ring_blocks(ring: Table, valences: np.ndarray, is_boundary: np.ndarray) -> tuple[RingTopology, ...]:

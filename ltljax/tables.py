@@ -28,6 +28,8 @@ else:
 
 # Beyond this many slots a loop unrolled over slots only costs compile time.
 _UNROLL = 32
+# Rows at once on the host.
+_PIECE = 1 << 13
 
 
 class Block(eqx.Module):
@@ -73,8 +75,34 @@ class Table(eqx.Module):
 
     def map(self, function: Callable[..., AnyArray], *per_block) -> AnyArray:
         """Apply ``function(block, *arguments of that block) -> (N, ...)`` to every block and put the rows together."""
-        rows = zip(self.blocks, *per_block, strict=True)
-        return self.rows_from([function(block, *arguments) for block, *arguments in rows])
+        return self.rows_from(self._apply(function, per_block, axis=0))
+
+    def each(self, function: Callable[..., Any], *per_block) -> list[Any]:
+        """Apply a function to every block; what it returns, arrays (..., N) in any nest, comes back one for each."""
+        return self._apply(function, per_block, axis=-1)
+
+    def _apply(self, function, per_block, axis):
+        results = []
+        for block, *arguments in zip(self.blocks, *per_block, strict=True):
+            parts = [function(*part) for part in _pieces(block, arguments)]
+            results.append(parts[0] if len(parts) == 1 else jax.tree.map(lambda *p: np.concatenate(p, axis), *parts))
+        return results
+
+
+def _pieces(block: Block, arguments: list[Any]):
+    """A block and what belongs to it, arrays (..., N) in any nest; on the host a few thousand rows at a time.
+
+    Intermediate arrays are many times the size of the block: in pieces they stay in the cache.
+    """
+    count = block.indices.shape[1]
+    if not isinstance(block.indices, np.ndarray) or count <= _PIECE:
+        yield block, *arguments
+        return
+    for start in range(0, count, _PIECE):
+        stop = min(start + _PIECE, count)
+        rows = np.arange(start, stop, dtype=np.int32) if block.rows is None else block.rows[start:stop]
+        here = Block(block.indices[:, start:stop], rows)
+        yield here, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
 
 
 def _take(values: AnyArray, indices: AnyArray) -> AnyArray:

@@ -13,14 +13,15 @@ PACKAGE = Path(__file__).parents[1] / "ltljax"
 MAY_IMPORT = {
     "mesh": set(),
     "tables": set(),
+    "progress": set(),
     "lifting": {"tables"},
-    "surface": {"mesh", "lifting", "tables"},
+    "surface": {"mesh", "lifting", "tables", "progress"},
     "operators": {"surface", "tables"},
     "equations": {"operators", "surface", "tables"},
     "solve": {"equations", "operators", "surface", "tables", "lifting"},
     "output": set(),
     "scenario": {"mesh", "equations", "operators", "surface", "solve"},
-    "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output"},
+    "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
     "cli": {"scenario", "run", "mesh", "solve"},
 }
 NO_JAX = ["mesh", "output", "lifting/support.py"]

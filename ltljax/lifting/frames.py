@@ -53,6 +53,14 @@ def boundary_frames(
     return xp.stack([unit(xp.cross(conormal, normals)), conormal], axis=1)
 
 
+def corner_conormals(
+    normals: Float[AnyArray, "N 3"], to_next: Float[AnyArray, "N 3"], to_previous: Float[AnyArray, "N 3"]
+) -> Float[AnyArray, "N 2 3"]:
+    """The outward conormals of both sides of a corner of the boundary: towards the next vertex, then the previous."""
+    xp = normals.__array_namespace__()
+    return xp.stack([unit(xp.cross(to_next, normals)), unit(xp.cross(-to_previous, normals))], axis=1)
+
+
 def transport(
     source: Float[AnyArray, "*#N 3"], target: Float[AnyArray, "*#N 3"], vectors: Float[AnyArray, "*#N 3"]
 ) -> Float[AnyArray, "*#N 3"]:

@@ -4,14 +4,14 @@ What enters: positions and `Topology`. What leaves: `Geometry`, a record of ever
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
 from ..tables import AnyArray, Block, Table, slot_sum
-from . import paper, quadratic
-from .frames import boundary_frames, tangent_frames, transport
+from . import jets, paper
+from .frames import boundary_frames, corner_conormals, tangent_frames, transport
 from .ring import Lift, RingTopology, centroid_normals, last_slot, lifted_ring, take_slots
 
 
@@ -34,7 +34,7 @@ class Monotone:
     The same two steps as the paper (lift the ring to the tangent plane, differentiate scattered data there), with
     refined normals. Non-negative weights give diffusion a maximum principle and its matrix no eigenvalue with
     positive real part. Solutions are second order in the mesh size; the pointwise Laplacian is first order on
-    irregular meshes. On a boundary the rows are those of a vanishing normal derivative (homogeneous Neumann).
+    irregular meshes.
 
     Attributes:
         lift: ``"chord"`` keeps the length of every edge; ``"projection"`` is the paper's lift. Chord is better but for
@@ -42,13 +42,34 @@ class Monotone:
     """
 
     lift: Lift = "chord"
+    degree: ClassVar[int] = 2
 
     def __post_init__(self):
         if self.lift not in ("chord", "projection"):
             raise ValueError(f'Expected lift="chord" or lift="projection", found {self.lift!r}.')
 
 
-Scheme = Paper | Monotone
+@dataclasses.dataclass(frozen=True)
+class Polynomial:
+    """Polynomial fits of degree 3 or 4 on about twice the neighbours they need, for smooth solutions on good meshes.
+
+    Normals, gradient and Hessian come from the same fit, and the Laplacian takes the metric of the fitted surface into
+    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. Weights of both signs: there is no
+    maximum principle, and on bad meshes the Laplacian can have growing modes; `solve` looks for them before it steps.
+
+    Attributes:
+        degree: 3 or 4.
+    """
+
+    degree: int = 4
+    lift: ClassVar[Lift] = "projection"
+
+    def __post_init__(self):
+        if self.degree not in (3, 4):
+            raise ValueError(f"Expected degree 3 or 4, found {self.degree!r}. Degree 2 is ltl.Monotone().")
+
+
+Scheme = Paper | Monotone | Polynomial
 PerBlock = tuple[AnyArray, ...]
 
 
@@ -59,7 +80,9 @@ class Topology(eqx.Module):
         faces: (F, 3) the triangles.
         ring: the one-rings, counter-clockwise.
         ring_blocks: for every block of ``ring``, which slots hold neighbours and faces.
-        is_boundary: (V,) whether the vertex lies on the boundary.
+        kinds: (V,) `INTERIOR`, `SMOOTH` boundary, `RIGHT_CORNER` or `OTHER_CORNER`, see `lifting.jets`.
+        boundary: (B,) the vertices on the boundary, loop by loop.
+        loops: (B,) the number of the boundary loop each of them lies on.
         jet: the neighbours of the gradient's fit.
         diffusion: the neighbours of the Laplacian; None where it is the divergence of the gradient.
     """
@@ -67,7 +90,9 @@ class Topology(eqx.Module):
     faces: Int[AnyArray, "F 3"]
     ring: Table
     ring_blocks: tuple[RingTopology, ...]
-    is_boundary: Bool[AnyArray, " V"]
+    kinds: Int[AnyArray, " V"]
+    boundary: Int[AnyArray, " B"]
+    loops: Int[AnyArray, " B"]
     jet: Table
     diffusion: Table | None
 
@@ -78,14 +103,17 @@ class Geometry(eqx.Module):
     Attributes:
         vertices: (V, 3).
         normals: (V, 3) unit normals.
-        frames: (V, 2, 3) orthonormal tangent vectors; on the boundary the second is the outward conormal.
+        frames: (V, 2, 3) orthonormal tangent vectors; on a smooth boundary the second is the outward conormal.
         vertex_areas: (V,) a third of the area of the faces at each vertex.
         gradient_weights: two sets of weights on the jet table, for the two components in the frame.
+        hessian_weights: three sets of weights on the jet table, for the components xx, xy, yy; None of `Paper`.
         divergence_weights: two sets of weights on the jet table, on the two components at the neighbours.
         divergence_centre: (V, 2) the weights on the vertex's own components that the difference form leaves over.
         laplacian_weights: weights on the diffusion table, or None.
         laplacian_residual: (V,) how far each Laplacian row is from consistent, relative, zero to rounding where it is;
             after moving the vertices it tells whether the frozen support still serves. None without such rows.
+        conormals: (B, 2, 3) the outward conormals of both sides of each boundary vertex, equal where it is smooth.
+        flux_weights: (B, 2) what a unit flux through each side adds to the Laplacian there; None without such rows.
     """
 
     vertices: Float[AnyArray, "V 3"]
@@ -93,10 +121,17 @@ class Geometry(eqx.Module):
     frames: Float[AnyArray, "V 2 3"]
     vertex_areas: Float[AnyArray, " V"]
     gradient_weights: tuple[PerBlock, PerBlock]
+    hessian_weights: tuple[PerBlock, PerBlock, PerBlock] | None
     divergence_weights: tuple[PerBlock, PerBlock]
     divergence_centre: Float[AnyArray, "V 2"]
     laplacian_weights: PerBlock | None
     laplacian_residual: Float[AnyArray, " V"] | None
+    conormals: Float[AnyArray, "B 2 3"]
+    flux_weights: Float[AnyArray, "B 2"] | None
+
+
+# The sine of the angle between two conormals below which they count as one.
+_PARALLEL = 0.1
 
 
 def ring_normals(
@@ -112,34 +147,44 @@ def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "
 
 
 def fitted_normals(
-    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table
+    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table, degree: int
 ) -> Float[AnyArray, "V 3"]:
-    """The given normals refined by the quadratic height fit on the jet table."""
-    return jet.map(lambda block: quadratic.refined_normals(offsets(vertices, block), block.centre(normals)))
+    """The given normals refined by the polynomial height fit on the jet table."""
+    return jet.map(lambda block: jets.refined_normals(offsets(vertices, block), block.centre(normals), degree))
 
 
 def vertex_frames(
     vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], topology: Topology
-) -> Float[AnyArray, "V 2 3"]:
-    """Tangent frames; at a boundary vertex the second vector is the outward conormal."""
+) -> tuple[Float[AnyArray, "V 2 3"], Float[AnyArray, "B 2 3"]]:
+    """Tangent frames, and the outward conormals of both sides of the boundary vertices.
 
-    xp = vertices.__array_namespace__()
+    On a smooth boundary the second vector of the frame is the conormal, at a corner it is that of the first side.
+    """
 
-    def frames(block, ring):
+    def frames(block, ring, kinds):
         to_neighbours = offsets(vertices, block)
         here = block.centre(normals)
-        along = boundary_frames(here, to_neighbours[0], last_slot(to_neighbours, ring))
-        return xp.where(ring.is_boundary[:, None, None], along, tangent_frames(here))
+        xp = here.__array_namespace__()
+        sides = corner_conormals(here, to_neighbours[0], last_slot(to_neighbours, ring))
+        smooth = boundary_frames(here, to_neighbours[0], last_slot(to_neighbours, ring))
+        is_corner = (kinds >= jets.RIGHT_CORNER)[:, None, None]
+        first = xp.stack([xp.cross(sides[:, 0], here), sides[:, 0]], axis=1)
+        along = xp.where(is_corner, first, smooth)
+        frame = xp.where((kinds == jets.INTERIOR)[:, None, None], tangent_frames(here), along)
+        both = xp.where(is_corner, sides, xp.stack([smooth[:, 1]] * 2, axis=1))
+        return xp.concatenate([frame, both], axis=1)
 
-    return topology.ring.map(frames, topology.ring_blocks)
+    kinds = tuple(block.centre(topology.kinds) for block in topology.ring.blocks)
+    vectors = topology.ring.map(frames, topology.ring_blocks, kinds)
+    return vectors[:, :2], vectors[topology.boundary, 2:]
 
 
 def weigh(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Geometry:
     """All weights of a scheme, a pure function of the positions."""
     normals = ring_normals(vertices, topology.ring, topology.ring_blocks)
-    if isinstance(scheme, Monotone):
-        normals = fitted_normals(vertices, normals, topology.jet)
-    return weigh_in_frames(scheme, vertices, topology, normals, vertex_frames(vertices, normals, topology))
+    if not isinstance(scheme, Paper):
+        normals = fitted_normals(vertices, normals, topology.jet, scheme.degree)
+    return weigh_in_frames(scheme, vertices, topology, normals, *vertex_frames(vertices, normals, topology))
 
 
 def weigh_in_frames(
@@ -148,54 +193,93 @@ def weigh_in_frames(
     topology: Topology,
     normals: Float[AnyArray, "V 3"],
     frames: Float[AnyArray, "V 2 3"],
+    conormals: Float[AnyArray, "B 2 3"],
 ) -> Geometry:
     """The weights of a scheme for given normals and tangent frames; operators do not depend on the choice of frames."""
     xp = vertices.__array_namespace__()
-    gradient_weights, divergence_weights = [], []
-    for position, block in enumerate(topology.jet.blocks):
-        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), scheme.lift)
+
+    def jet(block, *ring):
+        to_neighbours = offsets(vertices, block)
+        lifted = lifted_ring(to_neighbours, block.centre(frames), scheme.lift)
         if isinstance(scheme, Paper):
-            weights = paper.gradient_weights(lifted, topology.ring_blocks[position])
+            weights = xp.moveaxis(paper.gradient_weights(lifted, *ring), -1, 0)
         else:
-            weights = quadratic.gradient_weights(lifted)
+            weights = jets.jet_weights(lifted, scheme.degree)
+        if isinstance(scheme, Polynomial):
+            weights = jets.covariant(jets.height_jet(to_neighbours, block.centre(normals), weights), weights)
         # The divergence transports the neighbour's vector here and takes it against the weights; the same number is
         # the neighbour's own components against the weights transported there.
-        ambient = xp.einsum("kna,nac->knc", weights, block.centre(frames))
+        ambient = xp.einsum("akn,nac->knc", weights[:2], block.centre(frames))
         there = transport(block.centre(normals)[None], block.neighbours(normals), ambient)
-        gradient_weights.append(weights)
-        divergence_weights.append(xp.einsum("knc,knac->kna", there, block.neighbours(frames)))
-    gradient, divergence = _by_component(gradient_weights), _by_component(divergence_weights)
-    centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, gradient, strict=True)]
-    laplacian, residual = None, None
+        return tuple(weights), tuple(xp.einsum("knc,knac->akn", there, block.neighbours(frames)))
+
+    per_block = topology.jet.each(jet, *([topology.ring_blocks] if isinstance(scheme, Paper) else []))
+    derivatives = list(zip(*(weights for weights, _ in per_block), strict=True))
+    divergence = tuple(zip(*(weights for _, weights in per_block), strict=True))
+    centre = [
+        slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, derivatives[:2], strict=True)
+    ]
+    laplacian, residual, flux = None, None, None
     if topology.diffusion is not None:
-        laplacian, residual = diffusion_rows(scheme.lift, vertices, frames, topology.is_boundary, topology.diffusion)
+        laplacian, residual, first = diffusion_rows(scheme, vertices, normals, frames, topology.kinds, topology.diffusion)
+        flux = _flux_weights(first[topology.boundary], frames[topology.boundary], conormals)
     return Geometry(
         vertices=vertices,
         normals=normals,
         frames=frames,
         vertex_areas=_vertex_areas(vertices, topology),
-        gradient_weights=gradient,
+        gradient_weights=tuple(derivatives[:2]),
+        hessian_weights=tuple(derivatives[2:]) or None,
         divergence_weights=divergence,
         divergence_centre=xp.stack(centre, axis=-1),
         laplacian_weights=laplacian,
         laplacian_residual=residual,
+        conormals=conormals,
+        flux_weights=flux,
     )
 
 
 def diffusion_rows(
-    lift: Lift,
+    scheme: Monotone | Polynomial,
     vertices: Float[AnyArray, "V 3"],
+    normals: Float[AnyArray, "V 3"],
     frames: Float[AnyArray, "V 2 3"],
-    is_boundary: Bool[AnyArray, " V"],
+    kinds: Int[AnyArray, " V"],
     table: Table,
-) -> tuple[PerBlock, Float[AnyArray, " V"]]:
-    """The non-negative Laplacian weights on a table, and the relative moment residual of every row."""
-    rows = []
-    for block in table.blocks:
-        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), lift)
-        rows.append(quadratic.laplacian_weights(lifted, block.centre(is_boundary)))
-    weights, residuals = zip(*rows, strict=True)
-    return weights, table.rows_from(list(residuals))
+) -> tuple[PerBlock, Float[AnyArray, " V"], Float[AnyArray, "V 2"]]:
+    """The Laplacian weights on a table, the relative moment residual of every row, and its first moments."""
+
+    def rows(block):
+        to_neighbours = offsets(vertices, block)
+        lifted = lifted_ring(to_neighbours, block.centre(frames), scheme.lift)
+        xp = lifted.__array_namespace__()
+        targets = xp.asarray(jets.LAPLACIAN, dtype=lifted.dtype)[..., None]
+        if isinstance(scheme, Polynomial):
+            weights = jets.jet_weights(lifted, scheme.degree)
+            targets = jets.laplacian_targets(jets.height_jet(to_neighbours, block.centre(normals), weights))
+        c, residual = jets.operator_weights(
+            lifted, block.centre(kinds), targets, scheme.degree, nonnegative=isinstance(scheme, Monotone)
+        )
+        return c[0], residual[0], xp.einsum("kn,kna->an", c[0], lifted)
+
+    weights, residuals, first = zip(*table.each(rows), strict=True)
+    return weights, table.rows_from(list(residuals)), table.rows_from([moments.T for moments in first])
+
+
+def _flux_weights(first, frames, conormals):
+    """The weights (B, 2) of the fluxes through both sides, from the first moments (B, 2) of the Laplacian rows.
+
+    The rows leave ``-first . grad u`` over. On a smooth boundary the gradient's part along it has no weight; at a
+    corner the gradient g solves conormal . g = flux for both sides.
+    """
+    xp = first.__array_namespace__()
+    a, b = xp.moveaxis(xp.einsum("bsc,bac->bsa", conormals, frames), 1, 0)
+    determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    is_corner = xp.abs(determinant) > _PARALLEL
+    safe = xp.where(is_corner, determinant, 1)
+    corner = xp.stack([first[:, 1] * b[:, 0] - first[:, 0] * b[:, 1], first[:, 0] * a[:, 1] - first[:, 1] * a[:, 0]], axis=-1)
+    smooth = -first[:, 1:] / 2
+    return xp.where(is_corner[:, None], corner / safe[:, None], smooth)
 
 
 def _vertex_areas(vertices, topology):
@@ -208,7 +292,3 @@ def _vertex_areas(vertices, topology):
         return xp.sum(xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1)), 0), axis=0) / 6
 
     return topology.ring.map(area, topology.ring_blocks)
-
-
-def _by_component(weights: list[Float[AnyArray, "_ _ 2"]]) -> tuple[PerBlock, PerBlock]:
-    return tuple(w[..., 0] for w in weights), tuple(w[..., 1] for w in weights)

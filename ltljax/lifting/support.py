@@ -1,36 +1,40 @@
 """Which neighbours a row uses: chosen once, on the host, from the positions; frozen afterwards.
 
-What enters: the rings, laid into the tangent planes. What leaves: rows of neighbours (offsets and indices), for the
-gradient's fit and for the non-negative Laplacian, and a record of how each Laplacian row was found.
+What enters: the one-rings, and how to lay neighbours into tangent planes. What leaves: rows of neighbours (offsets and
+indices), for the fit of a polynomial and for non-negative operators, and a record of how the latter were found.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from scipy.optimize import nnls
 
-from .quadratic import moment_matrix, ring_moments
+from .jets import conditions, moment_matrix, num_monomials, ring_moments, scaled_targets
 from .ring import Lift, lifted_ring
 
-# A ring determines a quadratic when the least eigenvalue of its moment matrix is this large against the mean one; a
-# regular hexagon has 0.33, a ring of four none.
-_WELL_PLACED = 0.01
+# A ring determines a polynomial when the least eigenvalue of its moment matrix, scaled to unit diagonal, is this large.
+# A regular hexagon has 0.29 for a quadratic; neighbours on a conic have none.
+_WELL_PLACED = {2: 0.02, 3: 0.003, 4: 0.001}
 # Relative moment residual below which a row counts as consistent.
 CONSISTENT = 1e-8
 # Rings beyond the third reach so far that a row would no longer be local.
-_LARGEST_RING = 3
+LARGEST_RING = 3
+# Vertices at once.
+_BATCH = 1 << 13
 
 Rows = tuple[np.ndarray, np.ndarray]
 # All vertices within k edges of each of the given vertices, as rows.
 KRing = Callable[[np.ndarray, int], Rows]
-# Lifted coordinates (n, 2) of the given neighbours of one vertex.
-LiftAt = Callable[[int, np.ndarray], np.ndarray]
+# Lifted coordinates (K, N, 2) of neighbours (K, N) of vertices (N,).
+LiftAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# Hands on the batches it is given, and may show how far they are.
+Watch = Callable[[list[np.ndarray]], Iterable[np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
 class SupportRecord:
-    """How the Laplacian's rows were found: for every vertex the ring they use, and whether they are consistent.
+    """How the rows of a non-negative operator were found.
 
     Attributes:
         rings: (V,) the number of rings the row was chosen from, 1 to 3.
@@ -49,117 +53,177 @@ class SupportRecord:
 def lift_onto(vertices: np.ndarray, frames: np.ndarray, lift: Lift) -> LiftAt:
     """The lift of any neighbours of a vertex into its tangent plane."""
 
-    def lift_at(vertex: int, neighbours: np.ndarray) -> np.ndarray:
-        offsets = vertices[neighbours] - vertices[vertex]
-        return lifted_ring(offsets[:, None], frames[vertex][None], lift)[:, 0]
+    def lift_at(rows: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+        return lifted_ring(vertices[neighbours] - vertices[rows][None], frames[rows], lift)
 
     return lift_at
 
 
-def merge_rows(rows: Rows, replaced: dict[int, np.ndarray]) -> Rows:
-    """The rows with those of some vertices replaced."""
-    offsets, indices = rows
-    lengths = np.diff(offsets)
-    pieces, start = [], 0
-    for vertex in sorted(replaced):
-        lengths[vertex] = len(replaced[vertex])
-        pieces += [indices[start : offsets[vertex]], replaced[vertex]]
-        start = offsets[vertex + 1]
-    pieces.append(indices[start:])
-    return np.concatenate([[0], np.cumsum(lengths)]), np.concatenate(pieces).astype(indices.dtype)
+def fit_support(rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch: Watch) -> tuple[Rows, np.ndarray]:
+    """Rows that determine a polynomial fit.
 
+    A quadratic is fitted on the one-ring where that determines it, else on two rings, else on three. Higher degrees
+    use the nearest of three rings, twice as many as a fit needs, and all of them where those do not determine it.
 
-def split_rows(rows: Rows) -> list[np.ndarray]:
-    """The rows as a list of arrays."""
-    offsets, indices = rows
-    return np.split(indices, offsets[1:-1])
-
-
-def fit_support(rings: Rows, is_well_placed: np.ndarray, k_ring: KRing, lift_at: LiftAt) -> Rows:
-    """Rows that determine a quadratic fit: the one-ring where it does, else two rings, else three.
-
-    Args:
-        rings: the one-rings.
-        is_well_placed: (V,) whether the one-ring determines a quadratic, see `determines_quadratic`.
-        k_ring: the wider rings.
-        lift_at: the lifted coordinates of neighbours.
+    Returns:
+        The rows, and the vertices for which the first choice was not enough.
     """
-    wanting = np.flatnonzero(~is_well_placed)
-    chosen: dict[int, np.ndarray] = {}
-    for ring in range(2, _LARGEST_RING + 1):
-        if not len(wanting):
-            break
-        chosen.update(zip(wanting.tolist(), split_rows(k_ring(wanting, ring)), strict=True))
-        wanting = np.array(
-            [v for v in wanting.tolist() if not determines_quadratic(lift_at(v, chosen[v])[:, None])[0]], np.int64
-        )
-    return merge_rows(rings, chosen)
+    choices = [(1, None), (2, None), (3, None)] if degree == 2 else [(3, 2 * num_monomials(degree)), (3, None)]
+    rows, wanting = rings, np.arange(len(rings[0]) - 1)
+    wide = wanting
+    for attempt, (ring, nearest) in enumerate(choices):
+        found = _Found()
+        for batch, candidates in _candidates(wanting, rings, ring, k_ring, watch):
+            lifted = lift_at(batch, candidates)
+            is_used = candidates != batch[None]
+            if nearest is not None and nearest < len(candidates):
+                distance = np.where(is_used, np.sum(lifted**2, axis=-1), np.inf)
+                is_used &= distance <= np.partition(distance, nearest - 1, axis=0)[nearest - 1]
+                lifted = np.where(is_used[..., None], lifted, 0)
+            found.add(batch, candidates, is_used, determines_fit(lifted, degree))
+        rows = found.replace(rows)
+        wanting = found.wanting()
+        if attempt == 0:
+            wide = wanting
+    return rows, wide
 
 
-def determines_quadratic(lifted: np.ndarray) -> np.ndarray:
-    """Whether each lifted ring (K, N, 2) holds five neighbours in general position, (N,)."""
-    moments, weights, _ = ring_moments(lifted, np.zeros(lifted.shape[1], bool))
-    eigenvalues = np.linalg.eigvalsh(np.moveaxis(moment_matrix(moments, weights), -1, 0))
-    return eigenvalues[:, 0] > _WELL_PLACED * eigenvalues.mean(axis=1)
+def determines_fit(lifted: np.ndarray, degree: int) -> np.ndarray:
+    """Whether each lifted ring (K, N, 2) determines a polynomial of the degree, (N,)."""
+    moments, weights, _ = ring_moments(lifted, np.zeros(lifted.shape[1], np.int8), degree)
+    matrix = np.moveaxis(moment_matrix(moments, weights), -1, 0)
+    diagonal = np.einsum("nii->ni", matrix)
+    unscaled = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    return np.linalg.eigvalsh(matrix * unscaled[:, :, None] * unscaled[:, None])[:, 0] > _WELL_PLACED[degree]
 
 
 def nonnegative_support(
     rings: Rows,
-    one_ring_is_good: np.ndarray,
-    is_boundary: np.ndarray,
+    is_good: np.ndarray,
+    kinds: np.ndarray,
+    targets: np.ndarray,
     k_ring: KRing,
     lift_at: LiftAt,
+    watch: Watch,
 ) -> tuple[Rows, SupportRecord]:
-    """Rows on which Laplacian weights are non-negative: the one-ring, else what least squares picks from wider rings.
+    """Rows on which the weights of an operator are non-negative: the one-ring, else what least squares picks.
 
-    For a vertex whose one-ring has a negative weight, non-negative least squares solves the five moment conditions on
-    two rings, then on three, with columns scaled by r^-4 so that near neighbours win. It uses at most five neighbours.
+    For a vertex whose one-ring has a negative weight, non-negative least squares solves the moment conditions on two
+    rings, then on three, with columns scaled by r^-4 so that near neighbours win. It uses at most five neighbours.
     Where no ring has a consistent row, the row of least residual is kept: it is not consistent, but it is stable.
 
     Args:
         rings: the one-rings.
-        one_ring_is_good: (V,) whether the one-ring's weights are non-negative and consistent.
-        is_boundary: (V,) where the condition along the conormal is dropped.
+        is_good: (V,) whether the one-ring's weights are non-negative and consistent.
+        kinds: (V,) which conditions a vertex keeps.
+        targets: (5, V) or (5, 1) what the operator makes of x, y, xy, x^2, y^2.
         k_ring: the wider rings.
         lift_at: the lifted coordinates of neighbours.
+        watch: shows how far the choice has come.
     """
-    num_vertices = len(one_ring_is_good)
-    used_rings = np.ones(num_vertices, np.int8)
-    residual = np.zeros(num_vertices)
-    best: dict[int, np.ndarray] = {}
-    wanting = np.flatnonzero(~one_ring_is_good)
-    for ring in range(2, _LARGEST_RING + 1):
-        if not len(wanting):
-            break
-        for vertex, candidates in zip(wanting.tolist(), split_rows(k_ring(wanting, ring)), strict=True):
-            picked, found = _nonnegative_row(lift_at(vertex, candidates), bool(is_boundary[vertex]))
-            if vertex not in best or found < residual[vertex]:
-                best[vertex] = candidates[picked]
-                residual[vertex], used_rings[vertex] = found, ring
-        wanting = wanting[~(residual[wanting] <= CONSISTENT)]
-    return merge_rows(rings, best), SupportRecord(used_rings, residual)
+    num_vertices = len(is_good)
+    rows = rings
+    record = SupportRecord(np.ones(num_vertices, np.int8), np.where(is_good, 0, np.inf))
+    targets = np.broadcast_to(targets, (5, num_vertices))
+    wanting = np.flatnonzero(~is_good)
+    for ring in range(2, LARGEST_RING + 1):
+        found = _Found()
+        for batch, candidates in _candidates(wanting, rings, ring, k_ring, watch):
+            lifted = lift_at(batch, candidates)
+            is_picked, residual = _nonnegative_rows(lifted, kinds[batch], targets[:, batch])
+            is_better = residual < record.residual[batch]
+            here = batch[is_better]
+            record.rings[here], record.residual[here] = ring, residual[is_better]
+            found.add(here, candidates[:, is_better], is_picked[:, is_better], np.ones(len(here), bool))
+        rows = found.replace(rows)
+        wanting = wanting[~(record.residual[wanting] <= CONSISTENT)]
+    return rows, record
 
 
-def _nonnegative_row(lifted: np.ndarray, is_boundary: bool) -> tuple[np.ndarray, float]:
-    """The neighbours least squares picks from the lifted candidates (n, 2), and the relative moment residual."""
-    target = np.array([0, 0, 0, 2.0, 2.0])
-    picked = np.flatnonzero(np.sum(lifted**2, axis=-1) > 0)
-    found = 1.0
+def _nonnegative_rows(lifted: np.ndarray, kinds: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The neighbours least squares picks from lifted candidates (K, N, 2), as a mask (K, N), and the residuals (N,)."""
+    is_picked = np.sum(lifted**2, axis=-1) > 0
+    residual = np.ones(len(kinds))
     # The moments are scaled by the radius of the row, which is known only once it is picked. Where the row is exact the
     # scale is of no account and one pass is enough; elsewhere the passes settle on the row that the weights recompute.
-    for _ in range(_LARGEST_RING):
-        if not len(picked):
-            return picked, found
-        moments, weights, _ = ring_moments(lifted[picked][:, None], np.array([is_boundary]))
-        columns = weights[:, 0] ** 2
-        try:
-            c, _ = nnls(moments[:, :, 0] * columns, target)
-        except RuntimeError:  # no convergence: the candidates as they are cannot be worse than nothing
-            return picked[:0], found
-        found = float(np.abs(moments[:, :, 0] @ (columns * c) - target).max() / 2)
-        if np.all(c > 0):
+    todo = np.flatnonzero(is_picked.any(axis=0))
+    for _ in range(LARGEST_RING):
+        moments, weights, scale = ring_moments(np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2)
+        target = conditions(scaled_targets(targets[None, :, todo], scale), kinds[todo], 1)[0]
+        columns = weights**2
+        matrices = np.ascontiguousarray(np.moveaxis(moments * columns[None], -1, 0))
+        c = np.zeros(columns.shape)
+        for i, (matrix, right) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
+            c[:, i] = nnls(matrix, right)[0]
+        size = np.abs(target).max(axis=0)
+        error = np.abs(np.einsum("ikn,kn->in", moments, columns * c) - target).max(axis=0)
+        residual[todo] = error / np.where(size > 0, size, 1)
+        changed = np.any(is_picked[:, todo] != (c > 0), axis=0) & np.any(c > 0, axis=0)
+        is_picked[:, todo] = c > 0
+        todo = todo[changed & ~(residual[todo] <= CONSISTENT)]
+        if not len(todo):
             break
-        picked = picked[c > 0]
-        if found <= CONSISTENT:
-            break
-    return picked, found
+    return is_picked, residual
+
+
+def _candidates(
+    vertices: np.ndarray, rings: Rows, ring: int, k_ring: KRing, watch: Watch
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The rings of some vertices, a batch at a time: vertices (N,) and neighbours (K, N), padded with the vertex."""
+    lengths = np.diff(rings[0])[vertices]
+    # Rings of about the same size together, so that a pole of valence 500 pads only its like.
+    vertices = vertices[np.argsort(lengths, kind="stable")]
+    batches = [vertices[start : start + _BATCH] for start in range(0, len(vertices), _BATCH)]
+    for batch in watch(batches):
+        offsets, members = _rows_at(rings, batch) if ring == 1 else k_ring(batch, ring)
+        sizes = np.diff(offsets)
+        # A long row must not pad the whole batch.
+        by_size = np.argsort(sizes, kind="stable")
+        cuts = np.flatnonzero(np.diff(np.ceil(np.log2(np.maximum(sizes[by_size], 16))))) + 1
+        for part in np.split(by_size, cuts):
+            slot = np.arange(sizes[part].max(initial=0))[:, None]
+            position = np.minimum(offsets[part] + slot, max(len(members) - 1, 0))
+            own = batch[part]
+            yield own, np.where(slot < sizes[part], members[position] if len(members) else own, own)
+
+
+def _rows_at(rows: Rows, vertices: np.ndarray) -> Rows:
+    """The rows of some vertices."""
+    offsets, members = rows
+    sizes = np.diff(offsets)[vertices]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    position = np.arange(starts[-1]) + np.repeat(offsets[vertices] - starts[:-1], sizes)
+    return starts, members[position]
+
+
+class _Found:
+    """Rows found for some of the vertices, batch by batch."""
+
+    def __init__(self):
+        none = np.zeros(0, np.int64)
+        self._vertices, self._owners, self._members, self._is_good = [none], [none], [none], [np.zeros(0, bool)]
+
+    def add(self, vertices: np.ndarray, candidates: np.ndarray, is_used: np.ndarray, is_good: np.ndarray) -> None:
+        """The used ones of the candidates (K, N) of vertices (N,), and whether each row will do."""
+        column, slot = np.nonzero(is_used.T)
+        self._vertices.append(vertices)
+        self._owners.append(vertices[column])
+        self._members.append(candidates[slot, column])
+        self._is_good.append(is_good)
+
+    def wanting(self) -> np.ndarray:
+        """The vertices whose row will not do."""
+        return np.sort(np.concatenate(self._vertices)[~np.concatenate(self._is_good)])
+
+    def replace(self, rows: Rows) -> Rows:
+        """All rows, with those of these vertices replaced."""
+        offsets, members = rows
+        is_kept = np.ones(len(offsets) - 1, bool)
+        is_kept[np.concatenate(self._vertices)] = False
+        owners = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+        stays = is_kept[owners]
+        owners = np.concatenate([owners[stays], *self._owners])
+        members = np.concatenate([members[stays], *self._members])
+        order = np.argsort(owners, kind="stable")
+        sizes = np.bincount(owners, minlength=len(offsets) - 1)
+        return np.concatenate([[0], np.cumsum(sizes)]), members[order].astype(rows[1].dtype)

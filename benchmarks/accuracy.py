@@ -1,0 +1,526 @@
+"""Accuracy of the Laplacian of this package beside three others, regular meshes to random ones, with and without a rim.
+
+python benchmarks/accuracy.py [--refinements 4] [--families icosphere,disk] [--plot accuracy.png] [--json accuracy.json]
+
+Every number is an error against a closed formula: on each surface the field is a sum of eigenfunctions of the
+Laplace-Beltrami operator, so its Laplacian, its gradient, its decay by heat and the Poisson problem it solves are known.
+The others (libigl, robust-laplacian, LaPy; install ltljax[bench]) enter as -M^-1 S with a lumped mass matrix M.
+"""
+
+import argparse
+import contextlib
+import functools
+import io
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import igl  # noqa: E402
+import lapy  # noqa: E402
+import numpy as np  # noqa: E402
+import robust_laplacian  # noqa: E402
+import scipy.linalg  # noqa: E402
+import scipy.sparse  # noqa: E402
+import scipy.special  # noqa: E402
+from scipy.sparse.linalg import ArpackNoConvergence, eigs, splu  # noqa: E402
+
+import ltljax as ltl  # noqa: E402
+
+TIME = 0.1
+TIME_STEPS = 24
+NUM_EIGENVALUES = 12
+LARGEST_DENSE = 3000  # vertices, for the whole spectrum
+REFERENCE = "robust-laplacian"
+
+COLUMNS = {
+    "laplacian_rms": "Laplacian, rms",
+    "laplacian_max": "Laplacian, max",
+    "gradient": "gradient",
+    "heat": "heat",
+    "poisson": "Poisson",
+    "eigenvalues": "eigenvalues",
+    "largest_real_part": "largest Re / radius",
+    "negative_weights": "negative weights",
+    "mass_drift": "mass drift",
+}
+ERRORS = ("laplacian_rms", "laplacian_max", "gradient", "heat", "poisson", "eigenvalues")
+RATIOS = ("laplacian_rms", "laplacian_max", "heat", "poisson", "eigenvalues")
+
+
+# The exact side: eigenfunctions, their gradients, and the spectrum of four surfaces.
+
+
+class Mode(NamedTuple):
+    """An eigenfunction: Delta values = -eigenvalue * values, with its tangent gradient, on the vertices."""
+
+    eigenvalue: float
+    values: np.ndarray
+    gradient: np.ndarray
+
+
+class Family(NamedTuple):
+    """Meshes of one surface, refinement 0 with about 640 vertices and four times as many from one to the next."""
+
+    make: Callable[[int], ltl.Mesh]
+    modes: Callable[[np.ndarray], list[Mode]]
+    spectrum: Callable[[], np.ndarray]
+
+
+def sphere_modes(vertices):
+    """Spherical harmonics of degrees 2 and 3."""
+    x, y, z = vertices.T
+    return [
+        Mode(6.0, (x**2 - y**2) / 2, tangent_to_sphere(vertices, x, -y, 0 * z)),
+        Mode(12.0, x * y * z, tangent_to_sphere(vertices, y * z, x * z, x * y)),
+    ]
+
+
+def hemisphere_modes(vertices):
+    """Spherical harmonics of degrees 2 and 3, even in z, so that no flux crosses the equator."""
+    x, y, z = vertices.T
+    return [
+        Mode(6.0, (x**2 - y**2) / 2, tangent_to_sphere(vertices, x, -y, 0 * z)),
+        Mode(
+            12.0,
+            x * (5 * z**2 - 1) / 2,
+            tangent_to_sphere(vertices, 2 * z**2 - 1.5 * x**2 - 0.5 * y**2, -x * y, 4 * x * z),
+        ),
+    ]
+
+
+def tangent_to_sphere(normals, *gradient):
+    gradient = np.stack(gradient, axis=1)
+    return gradient - np.sum(gradient * normals, axis=1, keepdims=True) * normals
+
+
+def sphere_spectrum():
+    return np.repeat([degree * (degree + 1.0) for degree in range(1, 8)], [2 * degree + 1 for degree in range(1, 8)])
+
+
+def hemisphere_spectrum():
+    return np.repeat([degree * (degree + 1.0) for degree in range(1, 8)], [degree + 1 for degree in range(1, 8)])
+
+
+def disk_modes(vertices):
+    """J_m(k r) cos(m theta) for m = 0 and 1, with k the first positive zero of J_m', so that no flux crosses the rim."""
+    r, theta = np.hypot(vertices[:, 0], vertices[:, 1]), np.arctan2(vertices[:, 1], vertices[:, 0])
+    outwards = np.stack([np.cos(theta), np.sin(theta), 0 * theta], axis=1)
+    around = np.stack([-np.sin(theta), np.cos(theta), 0 * theta], axis=1)
+    modes = []
+    for m in (0, 1):
+        k = scipy.special.jnp_zeros(m, 1)[0]
+        slope = k * scipy.special.jvp(m, k * r) * np.cos(m * theta)
+        # J_1(k r) / r is written as k (J_0 + J_2) / 2, which is finite at the centre.
+        turn = -m * k * (scipy.special.jv(0, k * r) + scipy.special.jv(2, k * r)) / 2 * np.sin(m * theta)
+        values = scipy.special.jv(m, k * r) * np.cos(m * theta)
+        modes.append(Mode(k**2, values, slope[:, None] * outwards + turn[:, None] * around))
+    return modes
+
+
+def disk_spectrum():
+    squares = [np.repeat(scipy.special.jnp_zeros(m, 6) ** 2, 2 if m else 1) for m in range(10)]
+    return np.sort(np.concatenate(squares))
+
+
+MAJOR, MINOR = 2.0, 1.0
+TORUS_MODES = ((1, 3), (2, 2), (3, 1))  # waves around the axis, index of the profile around the tube
+FREQUENCIES = np.fft.fftfreq(65, 1 / 65)
+
+
+@functools.cache
+def torus_profiles(m):
+    """Eigenvalues and Fourier coefficients (N, 65) of the w in eigenfunctions w(p) cos(m q) of the torus.
+
+    -(s w')' / r^2 + m^2 w / s = eigenvalue * s w with s = a + r cos p, by Fourier collocation, exact to rounding.
+    """
+    p = 2 * np.pi * np.arange(len(FREQUENCIES)) / len(FREQUENCIES)
+    s = MAJOR + MINOR * np.cos(p)
+    derive = np.fft.ifft(1j * FREQUENCIES[:, None] * np.fft.fft(np.eye(len(p)), axis=0), axis=0).real
+    stiffness = derive.T @ np.diag(s) @ derive / MINOR**2 + np.diag(m**2 / s)
+    eigenvalues, profiles = scipy.linalg.eigh(stiffness, np.diag(s))
+    profiles = profiles * np.sign(profiles[1]) / np.abs(profiles).max(axis=0)
+    return eigenvalues, np.fft.fft(profiles, axis=0).T / len(p)
+
+
+def torus_modes(vertices):
+    """Eigenfunctions w(p) cos(m q), p around the tube and q around the axis."""
+    x, y, z = vertices.T
+    p, q = np.arctan2(z, np.hypot(x, y) - MAJOR), np.arctan2(y, x)
+    up = np.stack([-np.sin(p) * np.cos(q), -np.sin(p) * np.sin(q), np.cos(p)], axis=1)
+    around = np.stack([-np.sin(q), np.cos(q), 0 * q], axis=1)
+    waves = np.exp(1j * p[:, None] * FREQUENCIES)
+    modes = []
+    for m, index in TORUS_MODES:
+        eigenvalues, coefficients = torus_profiles(m)
+        w = (waves @ coefficients[index]).real
+        slope = (waves @ (1j * FREQUENCIES * coefficients[index])).real / MINOR * np.cos(m * q)
+        turn = -m * w * np.sin(m * q) / (MAJOR + MINOR * np.cos(p))
+        gradient = slope[:, None] * up + turn[:, None] * around
+        modes.append(Mode(eigenvalues[index], w * np.cos(m * q), gradient))
+    return modes
+
+
+def torus_spectrum():
+    values = [np.repeat(torus_profiles(m)[0][:12], 2 if m else 1) for m in range(10)]
+    return np.sort(np.concatenate(values))[1:]  # without the zero of the constants
+
+
+def jittered_hemisphere(refinement):
+    smooth = ltl.shapes.hemisphere(rings=14 * 2**refinement)
+    return ltl.shapes.jittered(smooth, 0.2, seed=0, project=lambda x: x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+FAMILIES = {
+    "icosphere": Family(lambda k: ltl.shapes.icosphere(3 + k), sphere_modes, sphere_spectrum),
+    "jittered sphere": Family(lambda k: ltl.shapes.jittered_sphere(3 + k, 0.5, seed=0), sphere_modes, sphere_spectrum),
+    "random sphere": Family(lambda k: ltl.shapes.random_sphere(640 * 4**k + 2, seed=0), sphere_modes, sphere_spectrum),
+    "torus": Family(lambda k: ltl.shapes.torus(MAJOR, MINOR, 36 * 2**k, 18 * 2**k), torus_modes, torus_spectrum),
+    "jittered torus": Family(
+        lambda k: ltl.shapes.jittered_torus(36 * 2**k, 18 * 2**k, amount=0.45, seed=0, major=MAJOR, minor=MINOR),
+        torus_modes,
+        torus_spectrum,
+    ),
+    "disk": Family(
+        lambda k: ltl.shapes.jittered(ltl.shapes.disk(rings=14 * 2**k), 0.2, seed=0), disk_modes, disk_spectrum
+    ),
+    "hemisphere": Family(jittered_hemisphere, hemisphere_modes, hemisphere_spectrum),
+}
+
+
+# The operators.
+
+
+class Operator(NamedTuple):
+    """A Laplacian as a matrix, the measure (V,) it keeps in heat flow, and a gradient where there is one.
+
+    Where ``is_symmetric``, diag(measure) @ matrix is symmetric.
+    """
+
+    matrix: scipy.sparse.csr_array
+    measure: np.ndarray
+    is_symmetric: bool
+    gradient: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+def ours(scheme, mesh):
+    """A scheme of this package; without a conserved measure of its own, the vertex areas stand in."""
+    surface = ltl.Surface.from_mesh(mesh, scheme)
+    measure = getattr(surface, "mass", None)
+    return Operator(
+        ltl.laplacian_matrix(surface),
+        np.asarray(surface.vertex_areas if measure is None else measure),
+        False,
+        lambda u: np.asarray(ltl.gradient(surface, u)),
+    )
+
+
+def libigl(mesh):
+    """Cotangent weights, mixed Voronoi areas, and the mean of the face gradients weighted by area."""
+    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
+
+    def gradient(u):
+        weighted = face_areas(mesh)[:, None] * (igl.grad(vertices, faces) @ u).reshape(3, -1).T
+        return vertex_sums(mesh, weighted) / vertex_sums(mesh, face_areas(mesh)[:, None])
+
+    stiffness = -igl.cotmatrix(vertices, faces)
+    mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI)
+    return finite_elements(stiffness, mass)._replace(gradient=gradient)
+
+
+def intrinsic_delaunay(mesh):
+    """Cotangent weights of the intrinsic Delaunay triangulation, barycentric areas."""
+    return finite_elements(*robust_laplacian.mesh_laplacian(mesh.vertices, mesh.faces, mollify_factor=1e-5))
+
+
+def lapy_linear(mesh):
+    """Linear finite elements with a lumped mass matrix: cotangent weights, barycentric areas."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        solver = lapy.Solver(lapy.TriaMesh(mesh.vertices, mesh.faces), lump=True)
+    return finite_elements(solver.stiffness, solver.mass)
+
+
+def finite_elements(stiffness, mass):
+    measure = mass.diagonal()
+    return Operator(scipy.sparse.csr_array(-scipy.sparse.diags_array(1 / measure) @ stiffness), measure, True)
+
+
+OTHERS = {"libigl": libigl, REFERENCE: intrinsic_delaunay, "LaPy": lapy_linear}
+
+
+def operators():
+    """Constructors by name: the schemes this version has, then the others."""
+    schemes = {
+        "Paper": ltl.Paper(),
+        "Monotone": ltl.Monotone(),
+        "Monotone(lift=projection)": ltl.Monotone(lift="projection"),
+    }
+    if polynomial := getattr(ltl, "Polynomial", None):
+        schemes |= {f"Polynomial(degree={degree})": polynomial(degree=degree) for degree in (3, 4)}
+    return {name: functools.partial(ours, scheme) for name, scheme in schemes.items()} | OTHERS
+
+
+def face_areas(mesh):
+    first, second, third = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
+
+
+def vertex_sums(mesh, on_faces):
+    """Sums (V, C) of face values (F, C) over the faces at each vertex."""
+    sums = np.zeros((len(mesh.vertices), on_faces.shape[1]))
+    np.add.at(sums, mesh.faces, on_faces[:, None])
+    return sums
+
+
+# The measurements.
+
+
+def measure(operator, mesh, modes, spectrum):
+    """All columns of one row; None where an operator has no such thing, "overflows" where heat grows."""
+    areas = vertex_sums(mesh, face_areas(mesh)[:, None])[:, 0] / 3
+    u0 = sum(mode.values for mode in modes)
+    laplacian = -sum(mode.eigenvalue * mode.values for mode in modes)
+    decayed = sum(np.exp(-mode.eigenvalue * TIME) * mode.values for mode in modes)
+    found = operator.matrix @ u0
+    row = {
+        "laplacian_rms": relative(found, laplacian),
+        "laplacian_max": np.abs(found - laplacian).max() / np.abs(laplacian).max(),
+        "gradient": None,
+        "heat": "overflows",
+        "poisson": relative(*(without_mean(u, areas) for u in (poisson(operator, laplacian, areas), u0)), areas),
+        "eigenvalues": eigenvalue_error(operator, spectrum),
+        "largest_real_part": largest_real_part(operator),
+        "negative_weights": negative_share(operator.matrix),
+        "mass_drift": "overflows",
+    }
+    if operator.gradient is not None:
+        row["gradient"] = relative(operator.gradient(u0), sum(mode.gradient for mode in modes))
+    u1 = heat(operator, u0)
+    if np.isfinite(u1).all() and np.linalg.norm(u1) < 10 * np.linalg.norm(u0):
+        row["heat"] = relative(u1, decayed, areas)
+        # Rows sum to zero, so u0 + 1 flows to u1 + 1.
+        row["mass_drift"] = abs(operator.measure @ (u1 - u0)) / abs(operator.measure @ (u0 + 1))
+    return {column: float(value) if isinstance(value, np.floating) else value for column, value in row.items()}
+
+
+def relative(found, exact, weights=1.0):
+    def size(field):
+        return np.sqrt(np.sum(np.multiply(weights, (field**2).T)))
+
+    return size(found - exact) / size(exact)
+
+
+def without_mean(u, areas):
+    return u - areas @ u / areas.sum()
+
+
+def heat(operator, u):
+    """u_t = Delta u up to TIME by the diagonal Pade approximant of order four; its error is below 1e-9 here.
+
+    (1 + z/2 + z^2/12) / (1 - z/2 + z^2/12) = 1 + 2 Re(residue / (z - pole)), one complex factorisation for all steps.
+    """
+    pole = 3 + 1j * np.sqrt(3)
+    residue = 12 * pole / (pole - pole.conjugate())
+    step = TIME / TIME_STEPS * operator.matrix
+    solve = splu(scipy.sparse.csc_array(step - pole * scipy.sparse.eye_array(len(u)))).solve
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(TIME_STEPS):
+            u = u + 2 * (residue * solve(u.astype(complex))).real
+    return u
+
+
+def poisson(operator, f, areas):
+    """The u of area mean zero with Delta u = f up to a constant."""
+    border = scipy.sparse.csr_array(np.ones((len(f), 1)))
+    system = scipy.sparse.block_array([[operator.matrix, border], [scipy.sparse.csr_array(areas[None]), None]])
+    return splu(scipy.sparse.csc_array(system)).solve(np.append(f, 0.0))[:-1]
+
+
+def eigenvalue_error(operator, spectrum):
+    """The worst relative error of the first nonzero eigenvalues, in order of their real parts."""
+    start = np.random.default_rng(0).normal(size=operator.matrix.shape[0])
+    try:
+        found = eigs(
+            scipy.sparse.csc_array(-operator.matrix),
+            NUM_EIGENVALUES + 1,
+            sigma=-0.1,
+            v0=start,
+            tol=1e-10,
+            return_eigenvectors=False,
+        )
+    except ArpackNoConvergence:
+        return None
+    exact = spectrum[:NUM_EIGENVALUES]
+    return np.max(np.abs(np.sort(np.delete(found, np.argmin(np.abs(found))).real) - exact) / exact)
+
+
+def largest_real_part(operator):
+    """Of the whole spectrum, by the spectral radius: positive where some field grows."""
+    if len(operator.measure) > LARGEST_DENSE:
+        return None
+    dense = operator.matrix.toarray()
+    if operator.is_symmetric:
+        root = np.sqrt(operator.measure)
+        eigenvalues = scipy.linalg.eigvalsh(root[:, None] * dense / root)
+    else:
+        eigenvalues = scipy.linalg.eigvals(dense)
+    return eigenvalues.real.max() / np.abs(eigenvalues).max()
+
+
+def negative_share(matrix):
+    """Of the weights of neighbours that are not zero to rounding."""
+    entries = matrix.tocoo()
+    weights = entries.data[entries.row != entries.col]
+    scale = np.abs(matrix.diagonal())[entries.row[entries.row != entries.col]]
+    return np.mean(weights[np.abs(weights) > 1e-12 * scale] < 0)
+
+
+# The output.
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--refinements", type=int, default=4, help="meshes of each family, from 640 vertices on")
+    parser.add_argument("--families", default=",".join(FAMILIES), help=f"among {', '.join(FAMILIES)}")
+    parser.add_argument("--plot", help="write a picture of the errors over the mesh size to this file")
+    parser.add_argument("--json", help="write the rows to this file")
+    arguments = parser.parse_args()
+    families = [name.strip() for name in arguments.families.split(",")]
+    if unknown := set(families) - set(FAMILIES):
+        parser.error(f"no such family: {', '.join(sorted(unknown))}; choose among {', '.join(FAMILIES)}")
+
+    rows = [row for family in families for row in family_rows(family, arguments.refinements)]
+    print_rows(rows)
+    if arguments.refinements > 1:
+        print_orders(rows)
+    print_ratios(rows)
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(rows, file, indent=1)
+    if arguments.plot:
+        plot(rows, arguments.plot)
+
+
+def family_rows(name, refinements):
+    family = FAMILIES[name]
+    spectrum = family.spectrum()
+    for refinement in range(refinements):
+        mesh = family.make(refinement)
+        modes = family.modes(mesh.vertices)
+        for operator_name, make in operators().items():
+            start = time.perf_counter()
+            row = dict(
+                family=name, vertices=len(mesh.vertices), mesh_size=float(mesh.mesh_size), operator=operator_name
+            )
+            row |= measure(make(mesh), mesh, modes, spectrum)
+            seconds = time.perf_counter() - start
+            print(f"{name}, {len(mesh.vertices)} vertices, {operator_name}: {seconds:.1f} s", file=sys.stderr)
+            yield row
+
+
+def print_rows(rows):
+    print_table(
+        ["mesh", "vertices", "operator", *COLUMNS.values()],
+        [[row["family"], row["vertices"], row["operator"], *(cell(row, column) for column in COLUMNS)] for row in rows],
+    )
+
+
+def cell(row, column):
+    value = row[column]
+    if value is None or isinstance(value, str):
+        return value or "-"
+    return f"{100 * value:.1f} %" if column == "negative_weights" else f"{value:.1e}"
+
+
+def print_orders(rows):
+    print("\nOrders: the slope of log(error) over log(mean edge length), by least squares.\n")
+    body = [
+        [family, operator, *(order(group, column) for column in ERRORS)]
+        for (family, operator), group in by_curve(rows).items()
+    ]
+    print_table(["mesh", "operator", *(COLUMNS[column] for column in ERRORS)], body)
+
+
+def by_curve(rows):
+    curves = {}
+    for row in rows:
+        curves.setdefault((row["family"], row["operator"]), []).append(row)
+    return curves
+
+
+def order(group, column):
+    if not all(isinstance(row[column], float) for row in group):
+        return "-"
+    slope = np.polyfit(np.log([row["mesh_size"] for row in group]), np.log([row[column] for row in group]), 1)[0]
+    return f"{slope:.1f}"
+
+
+def print_ratios(rows):
+    print(f"\nErrors on the finest mesh, divided by those of {REFERENCE}: below 1 is better.\n")
+    finest = {key: group[-1] for key, group in by_curve(rows).items()}
+    body = [
+        [family, operator, *(ratio(row[column], finest[family, REFERENCE][column]) for column in RATIOS)]
+        for (family, operator), row in finest.items()
+        if operator != REFERENCE
+    ]
+    print_table(["mesh", "operator", *(COLUMNS[column] for column in RATIOS)], body)
+
+
+def ratio(found, reference):
+    return f"{found / reference:.2f}" if isinstance(found, float) and isinstance(reference, float) else "-"
+
+
+def print_table(header, body):
+    for line in (header, ["---"] * len(header), *body):
+        print(f"| {' | '.join(map(str, line))} |")
+
+
+def plot(rows, path):
+    """One column of panels per mesh family; this package in full lines, the others dashed, second order in grey."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    names = list(dict.fromkeys(row["operator"] for row in rows))
+    shown = {"heat": "heat", "poisson": "Poisson", "laplacian_rms": "Laplacian, pointwise"}
+    figure, panels = plt.subplots(3, len(families), figsize=(2.6 * len(families) + 1, 8.6), sharex="col", squeeze=False)
+    for row_of_panels in panels:
+        for panel in row_of_panels[1:]:
+            panel.sharey(row_of_panels[0])
+            panel.tick_params(labelleft=False)
+    styles = dict(zip(names, plt.get_cmap("tab10").colors, strict=False))
+    curves = by_curve(rows)
+    for across, family in enumerate(families):
+        panels[0, across].set_title(family)
+        panels[-1, across].set_xlabel("mean edge length")
+        for down, column in enumerate(shown):
+            panel = panels[down, across]
+            for name in names:
+                points = [(row["mesh_size"], row[column]) for row in curves[family, name] if row[column] != "overflows"]
+                line = "s--" if name in OTHERS else "o-"
+                panel.loglog(*np.reshape(points, (-1, 2)).T, line, color=styles[name], label=name, markersize=4)
+            panel.grid(alpha=0.3, which="major")
+            guide(panel, [row["mesh_size"] for row in curves[family, names[0]]], curves[family, REFERENCE][-1][column])
+    for label, panel in zip(shown.values(), panels[:, 0], strict=True):
+        panel.set_ylabel(f"{label}: relative error")
+    handles, labels = panels[-1, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
+    figure.tight_layout(rect=(0, 0.04, 1, 1))
+    figure.savefig(path, dpi=150)
+
+
+def guide(panel, sizes, anchor):
+    """Second order in grey, through a third of the error ``anchor`` on the finest mesh."""
+    sizes = np.array(sizes)
+    panel.loglog(sizes, anchor / 3 * (sizes / sizes[-1]) ** 2, color="0.6", linewidth=1, label="second order", zorder=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""How far a long piece of work is, said on the terminal."""
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+
+def watched(what: str, *, progress: bool = True, unit: str = "batch") -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Hands on the steps it is given and, if asked, shows a bar with the remaining time: of tqdm where that is at hand.
+
+    Args:
+        what: what is being done.
+        progress: whether to show anything.
+        unit: what a step is.
+    """
+
+    def watch(steps: Sequence[Any]) -> Iterable[Any]:
+        if not progress:
+            return steps
+        try:
+            from tqdm import tqdm  # in the extra `app`
+        except ImportError:
+            return _plain(steps, what)
+        return tqdm(steps, desc=what, unit=unit, dynamic_ncols=True)
+
+    return watch
+
+
+def _plain(steps: Sequence[Any], what: str) -> Iterator[Any]:
+    start = time.perf_counter()
+    for done, step in enumerate(steps):
+        if done and done % max(1, len(steps) // 10) == 0:
+            left = (time.perf_counter() - start) / done * (len(steps) - done)
+            print(f"{what}: {100 * done // len(steps)} %, about {left:.0f} s left", file=sys.stderr)
+        yield step
