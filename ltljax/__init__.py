@@ -13,7 +13,17 @@ from importlib.metadata import version as _version
 from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
 from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
-from .operators import divergence, gradient, integrate, laplacian, laplacian_matrix
+from .operators import (
+    Curvature,
+    curvature,
+    divergence,
+    gradient,
+    hessian,
+    integrate,
+    laplacian,
+    laplacian_matrix,
+    weighted_laplacian,
+)
 from .solve import RKC2, Solution, SolveError, solve
 from .surface import InconsistentRowsWarning, Surface
 
@@ -21,6 +31,7 @@ __version__ = _version("ltljax")
 
 __all__ = [
     "RKC2",
+    "Curvature",
     "Diffusion",
     "Equation",
     "InconsistentRowsWarning",
@@ -33,8 +44,10 @@ __all__ = [
     "Solution",
     "SolveError",
     "Surface",
+    "curvature",
     "divergence",
     "gradient",
+    "hessian",
     "integrate",
     "kinetics",
     "laplacian",
@@ -42,4 +55,5 @@ __all__ = [
     "load_mesh",
     "shapes",
     "solve",
+    "weighted_laplacian",
 ]

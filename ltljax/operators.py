@@ -15,15 +15,16 @@ import scipy.sparse
 from jaxtyping import Array, Float
 
 from .surface import Surface
-from .tables import AnyArray, coordinates, difference_sum, slot_sum
+from .tables import AnyArray, difference_matrix, difference_sum, slot_sum
 
 
 @eqx.filter_jit
 def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3"]:
     """The surface gradient of u, tangent, in ambient coordinates.
 
-    ``Monotone``: the quadratic fit on the lifted ring, second order. ``Paper``: the mean of affine gradients over the
-    faces, first order on irregular meshes and second on symmetric rings.
+    ``Monotone``: the quadratic fit on the lifted ring, second order. ``Polynomial``: the fit of its degree, of that
+    order. ``Paper``: the mean of affine gradients over the faces, first order on irregular meshes and second on
+    symmetric rings.
 
     Args:
         surface: the surface.
@@ -62,19 +63,29 @@ def divergence(surface: Surface, X: Float[AnyArray, "V *C"]) -> Float[Array, "V 
 
 
 @eqx.filter_jit
-def laplacian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
+def laplacian(
+    surface: Surface, u: Float[AnyArray, "V *S"], flux: Float[AnyArray, "..."] | None = None
+) -> Float[Array, "V *S"]:
     """The Laplace-Beltrami operator, Delta u = div grad u: on the unit sphere ``laplacian(x1) = -2 x1``.
 
     ``Monotone``: one sum over non-negative weights; pointwise first order on irregular meshes and second on symmetric
-    rings, second order in solved problems; on a boundary, for fields whose normal derivative vanishes. ``Paper``: the
-    divergence of the gradient, which does not converge pointwise on irregular meshes.
+    rings, second order in solved problems. ``Polynomial``: one order less than its degree, in solved problems of order
+    2 (degree 3) and 4 (degree 4); weights of both signs. On a boundary both are for fields whose normal derivative
+    vanishes, unless a flux is given. ``Paper``: the divergence of the gradient, which does not converge pointwise on
+    irregular meshes and knows of no flux.
 
     Args:
         surface: the surface.
         u: (V,) or (V, S).
+        flux: the derivative of u along the outward conormal of the boundary, (V,) or (V, S), or the gradient it is the
+            part of, (V, 3) or (V, S, 3), which serves both sides of a corner; used at boundary vertices only. Zero by
+            default.
 
     Returns:
         The same shape.
+
+    Raises:
+        ValueError: a flux was given to `Paper`, or does not fit u.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 2; Wu, Chen and Chi, arXiv 1310.4807, for the configuration
     equation behind ``Monotone``.
@@ -82,34 +93,161 @@ def laplacian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *
     _check_rows(surface, u, "u")
     table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
     if table is None or weights is None:
+        if flux is not None:
+            raise ValueError("Paper() knows of no flux through a boundary. Use ltl.Monotone() or ltl.Polynomial().")
         return _divergence_in_frame(surface, *_gradient_in_frame(surface, u))
-    return difference_sum(table, weights, u)
+    rate = difference_sum(table, weights, u)
+    return rate if flux is None else add_flux(surface, rate, u, jnp.asarray(flux, u.dtype))
+
+
+def add_flux(
+    surface: Surface, rate: Float[Array, "V *S"], u: Float[AnyArray, "V *S"], flux: Float[Array, "..."]
+) -> Float[Array, "V *S"]:
+    """What a flux through the boundary adds to the Laplacian of u: see `laplacian`."""
+    if flux.shape not in (u.shape, (*u.shape, 3)):
+        raise ValueError(f"Expected a flux of shape {u.shape}, or {(*u.shape, 3)} for a gradient, found {flux.shape}.")
+    boundary, conormals = surface.topology.boundary, surface.geometry.conormals
+    here = flux[boundary]
+    if flux.ndim > u.ndim:
+        through = jnp.einsum("b...c,bsc->sb...", here, conormals)
+    else:
+        through = jnp.broadcast_to(here[None], (2, *here.shape))
+    through = jnp.einsum("sb...,bs->b...", through, surface.geometry.flux_weights)
+    return rate.at[boundary].add(through, unique_indices=True)
 
 
 @eqx.filter_jit
-def integrate(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "*S"]:
-    """The integral of u over the surface, with the vertex areas as quadrature: second order.
+def weighted_laplacian(
+    surface: Surface, conductivity: Float[AnyArray, " V"], u: Float[AnyArray, "V *S"]
+) -> Float[Array, "V *S"]:
+    """div(g grad u) for a conductivity g, as sum_k c[k] (g_k + g_v) / 2 (u_k - u_v) over the Laplacian's weights c.
+
+    Of the Laplacian's order; with ``Monotone`` and g >= 0 the weights stay non-negative and the maximum principle
+    holds. On a boundary, for fields whose normal derivative vanishes. g may depend on u, which makes diffusion
+    nonlinear.
+
+    Args:
+        surface: the surface.
+        conductivity: g, (V,).
+        u: (V,) or (V, S).
+
+    Returns:
+        The same shape as u.
+    """
+    _check_rows(surface, u, "u")
+    _check_rows(surface, conductivity, "conductivity")
+    table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
+    if table is None or weights is None:
+        x, y = _gradient_in_frame(surface, u)
+        g = conductivity.reshape(-1, *(1,) * (u.ndim - 1))
+        return _divergence_in_frame(surface, g * x, g * y)
+    means = table.each(lambda block: (block.neighbours(conductivity) + block.centre(conductivity)[None]) / 2)
+    return difference_sum(table, tuple(w * g for w, g in zip(weights, means, strict=True)), u)
+
+
+@eqx.filter_jit
+def hessian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3 3"]:
+    """The covariant second derivative of u, symmetric and tangent, in ambient coordinates.
+
+    From the same fit as the gradient; its trace is the Laplacian wherever that is taken on the same neighbours. First
+    order on irregular meshes and second on symmetric rings for ``Monotone``, one less than the degree and the next
+    even number for ``Polynomial``.
 
     Args:
         surface: the surface.
         u: (V,) or (V, S).
 
     Returns:
+        (V, 3, 3) or (V, S, 3, 3).
+
+    Raises:
+        ValueError: `Paper` has no second derivatives of its own.
+    """
+    _check_rows(surface, u, "u")
+    xx, xy, yy = _second_derivatives(surface, u)
+    components = jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
+    frames = surface.geometry.frames
+    return jnp.einsum("abv...,vac,vbd->v...cd", components, frames, frames)
+
+
+class Curvature(eqx.Module):
+    """How a surface bends. Positive where it bends away from the normal: a sphere of radius R has 1 / R.
+
+    Attributes:
+        shape_operator: (V, 3, 3) the derivative of the normal, symmetric and tangent, in ambient coordinates.
+        mean: (V,) H, half its trace.
+        gauss: (V,) K, its determinant in the tangent plane.
+        principal: (V, 2) its eigenvalues, the larger first.
+        directions: (V, 2, 3) the unit tangent vectors they belong to.
+    """
+
+    shape_operator: Float[Array, "V 3 3"]
+    mean: Float[Array, " V"]
+    gauss: Float[Array, " V"]
+    principal: Float[Array, "V 2"]
+    directions: Float[Array, "V 2 3"]
+
+
+@eqx.filter_jit
+def curvature(surface: Surface) -> Curvature:
+    """The curvature of a surface, from the second derivatives of its height over each tangent plane.
+
+    First order on irregular meshes for ``Monotone``, one less than its degree for ``Polynomial``; differentiable in
+    the vertices, but for the principal directions where both curvatures are equal.
+
+    Raises:
+        ValueError: `Paper` has no second derivatives of its own.
+    """
+    frames, normals = surface.geometry.frames, surface.normals
+    xx, xy, yy = (-jnp.sum(part * normals, axis=-1) for part in _second_derivatives(surface, surface.vertices))
+    mean, gauss = (xx + yy) / 2, xx * yy - xy**2
+    half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
+    # Where both curvatures are equal the root has no derivative and the angle no value: any will do.
+    is_umbilic = squared == 0
+    root = jnp.where(is_umbilic, 0, jnp.sqrt(jnp.where(is_umbilic, 1, squared)))
+    angle = jnp.arctan2(jnp.where(is_umbilic, 0, xy), jnp.where(is_umbilic, 1, half)) / 2
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    turned = jnp.stack([jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)], axis=1)
+    components = jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
+    return Curvature(
+        shape_operator=jnp.einsum("abv,vac,vbd->vcd", components, frames, frames),
+        mean=mean,
+        gauss=gauss,
+        principal=jnp.stack([mean + root, mean - root], axis=-1),
+        directions=jnp.einsum("vpa,vac->vpc", turned, frames),
+    )
+
+
+@eqx.filter_jit
+def integrate(
+    surface: Surface, u: Float[AnyArray, "V *S"], measure: Float[AnyArray, " V"] | None = None
+) -> Float[Array, "*S"]:
+    """The integral of u over the surface: second order.
+
+    Args:
+        surface: the surface.
+        u: (V,) or (V, S).
+        measure: the weight of each vertex, (V,); by default the vertex areas. With ``surface.mass`` the integral does
+            not change while u diffuses.
+
+    Returns:
         A scalar, or (S,).
     """
     _check_rows(surface, u, "u")
-    return jnp.tensordot(surface.vertex_areas, u, axes=1)
+    measure = surface.vertex_areas if measure is None else measure
+    _check_rows(surface, measure, "measure")
+    return jnp.tensordot(measure, u, axes=1)
 
 
 def laplacian_matrix(surface: Surface) -> scipy.sparse.csr_array:
     """The Laplacian as a SciPy sparse matrix (V, V), for other people's solvers (host)."""
     geometry, topology = surface.geometry, surface.topology
     if topology.diffusion is not None:
-        return _difference_matrix(topology.diffusion, geometry.laplacian_weights)
+        return difference_matrix(topology.diffusion, geometry.laplacian_weights)
     centre = np.asarray(geometry.divergence_centre)
     parts = [
-        (_difference_matrix(topology.jet, divergence) + scipy.sparse.diags_array(centre[:, axis]))
-        @ _difference_matrix(topology.jet, geometry.gradient_weights[axis])
+        (difference_matrix(topology.jet, divergence) + scipy.sparse.diags_array(centre[:, axis]))
+        @ difference_matrix(topology.jet, geometry.gradient_weights[axis])
         for axis, divergence in enumerate(geometry.divergence_weights)
     ]
     return scipy.sparse.csr_array(parts[0] + parts[1])
@@ -123,9 +261,9 @@ def spectral_bound(surface: Surface) -> Float[Array, ""]:
     between its negative and zero. For ``Paper`` it bounds the product of divergence and gradient.
     """
     geometry, topology = surface.geometry, surface.topology
-    if topology.diffusion is not None and geometry.laplacian_weights is not None:
-        return 2 * jnp.max(slot_sum(topology.diffusion, geometry.laplacian_weights))
     size = functools.partial(jax.tree.map, jnp.abs)
+    if topology.diffusion is not None and geometry.laplacian_weights is not None:
+        return 2 * jnp.max(slot_sum(topology.diffusion, size(geometry.laplacian_weights)))
     steep = sum(slot_sum(topology.jet, size(weights)) for weights in geometry.gradient_weights)
     spread = sum(slot_sum(topology.jet, size(weights)) for weights in geometry.divergence_weights)
     return (2 * jnp.max(spread) + jnp.max(jnp.abs(geometry.divergence_centre))) * 2 * jnp.max(steep)
@@ -135,6 +273,14 @@ def _gradient_in_frame(surface: Surface, u: Array) -> tuple[Array, Array]:
     along_e1, along_e2 = surface.geometry.gradient_weights
     table = surface.topology.jet
     return difference_sum(table, along_e1, u), difference_sum(table, along_e2, u)
+
+
+def _second_derivatives(surface: Surface, u: Array) -> tuple[Array, Array, Array]:
+    weights = surface.geometry.hessian_weights
+    if weights is None:
+        raise ValueError("Paper() has no second derivatives of its own. Use ltl.Monotone() or ltl.Polynomial().")
+    xx, xy, yy = (difference_sum(surface.topology.jet, w, u) for w in weights)
+    return xx, xy, yy
 
 
 def _divergence_in_frame(surface: Surface, x: Array, y: Array) -> Array:
@@ -154,10 +300,3 @@ def _check_rows(surface: Surface, field: AnyArray, name: str) -> None:
         raise ValueError(
             f"Expected {name} with one row per vertex, ({surface.num_vertices}, ...), found shape {field.shape}."
         )
-
-
-def _difference_matrix(table, weights) -> scipy.sparse.csr_array:
-    rows, columns, values = coordinates(table, weights)
-    size = table.num_vertices
-    neighbours = scipy.sparse.csr_array((values, (rows, columns)), shape=(size, size))
-    return scipy.sparse.csr_array(neighbours - scipy.sparse.diags_array(np.asarray(slot_sum(table, weights))))

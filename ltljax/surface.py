@@ -7,6 +7,7 @@ everything is a pure function of them.
 import dataclasses
 import functools
 import warnings
+import weakref
 from collections.abc import Callable
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .conservation import stationary_measure
 from .lifting import support
 from .lifting.frames import tangent_frames
 from .lifting.jets import INTERIOR, LAPLACIAN, OTHER_CORNER, RIGHT_CORNER, SMOOTH
@@ -36,7 +38,7 @@ from .lifting.schemes import (
 )
 from .mesh import Mesh, OneRings, k_ring, one_rings
 from .progress import watched
-from .tables import AnyArray, Table, build_table
+from .tables import AnyArray, Table, build_table, difference_matrix
 
 # A boundary that turns by more than this many degrees at a vertex has a corner there, and within so many degrees of a
 # right angle it counts as one.
@@ -183,6 +185,33 @@ class Surface(eqx.Module):
         return self.geometry.vertex_areas
 
     @property
+    def mass(self) -> Float[Array, " V"]:
+        """The measure that diffusion conserves: ``sum(mass * u)`` does not change while u diffuses without flux.
+
+        The stationary measure of the random walk whose generator is the Laplacian: non-negative, close to the vertex
+        areas, with the same sum on every connected component; zero at a vertex that no other vertex's row uses. One
+        sparse solve on the host when it is first asked for; kept as long as the surface's weights are.
+
+        Raises:
+            ValueError: the scheme is not `Monotone`, or the surface is being traced: take the mass outside of jit and
+                hand it in.
+        """
+        weights, diffusion = self.geometry.laplacian_weights, self.topology.diffusion
+        if not isinstance(self.scheme, Monotone) or weights is None or diffusion is None:
+            raise ValueError(f"Only Monotone() has non-negative weights and so a conserved measure, not {self.scheme}.")
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self.geometry)):
+            raise ValueError(
+                "The mass is computed on the host, but the surface is being traced by a JAX transformation. Take "
+                "`mass = surface.mass` outside and hand it in as an argument."
+            )
+        key = id(weights[0])
+        if key not in _MASSES:
+            areas = np.asarray(self.vertex_areas)
+            _MASSES[key] = jnp.asarray(stationary_measure(difference_matrix(diffusion, weights), areas), self.dtype)
+            weakref.finalize(weights[0], _MASSES.pop, key, None)
+        return _MASSES[key]
+
+    @property
     def num_vertices(self) -> int:
         """Number of vertices."""
         return self.topology.ring.num_vertices
@@ -194,6 +223,9 @@ class Surface(eqx.Module):
 
 
 _weigh = eqx.filter_jit(weigh)
+
+# By the identity of the weights they belong to, for as long as those live.
+_MASSES: dict[int, Array] = {}
 
 
 def _inconsistent(report: SurfaceReport) -> str:
@@ -224,7 +256,7 @@ def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -
     rings = one_rings(mesh.faces, mesh.num_vertices)
     ring = build_table(rings.offsets, rings.neighbours)
     ring_blocks = _ring_blocks(ring, rings.valences, mesh.boundary_vertices)
-    normals = ring_normals(mesh.vertices, ring, ring_blocks)
+    normals = ring_normals(scheme, mesh.vertices, ring, ring_blocks)
     loops = mesh.boundary_loops
     topology = Topology(
         faces=mesh.faces.astype(np.int32),

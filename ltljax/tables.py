@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Float, Int
 
 # Tables are built and weighed on the host in NumPy, and used on the device; code that serves both asks the array for
@@ -191,3 +192,11 @@ def coordinates(table: Table, weights: tuple[Array, ...]) -> tuple[np.ndarray, n
         columns.append(index[used])
         values.append(value[used])
     return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+
+def difference_matrix(table: Table, weights: tuple[Array, ...]) -> scipy.sparse.csr_array:
+    """The sparse matrix (V, V) of `difference_sum` (host)."""
+    rows, columns, values = coordinates(table, weights)
+    size = table.num_vertices
+    neighbours = scipy.sparse.csr_array((values, (rows, columns)), shape=(size, size))
+    return scipy.sparse.csr_array(neighbours - scipy.sparse.diags_array(np.asarray(slot_sum(table, weights))))

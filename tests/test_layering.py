@@ -14,8 +14,9 @@ MAY_IMPORT = {
     "mesh": set(),
     "tables": set(),
     "progress": set(),
+    "conservation": set(),
     "lifting": {"tables"},
-    "surface": {"mesh", "lifting", "tables", "progress"},
+    "surface": {"mesh", "lifting", "tables", "progress", "conservation"},
     "operators": {"surface", "tables"},
     "equations": {"operators", "surface", "tables"},
     "solve": {"equations", "operators", "surface", "tables", "lifting"},
@@ -24,7 +25,7 @@ MAY_IMPORT = {
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
     "cli": {"scenario", "run", "mesh", "solve"},
 }
-NO_JAX = ["mesh", "output", "lifting/support.py"]
+NO_JAX = ["mesh", "output", "lifting/support.py", "conservation.py", "progress.py"]
 
 
 def files(room):

@@ -38,6 +38,7 @@ def operator_weights(
     degree: int = 2,
     *,
     nonnegative: bool = False,
+    emphasis: float = 1.0,
 ) -> tuple[Float[AnyArray, "R K N"], Float[AnyArray, "R N"]]:
     """Weights c of R operators, each as sum_k c[k] (u(v_k) - u(v)), and the moment residual of each row.
 
@@ -54,13 +55,14 @@ def operator_weights(
         degree: of the polynomial; a support that does not determine it leaves the highest terms unmatched.
         nonnegative: cut weights off below zero. On a support where the fit is negative or has no solution this makes
             the row inconsistent, and the residual says so.
+        emphasis: how much more the conditions on sum c x and sum c y count where not all can be met.
 
     Returns:
         The weights, and the largest error of a condition over the largest target, zero to rounding where a row is exact.
     """
     xp = lifted.__array_namespace__()
-    moments, weights, scale = ring_moments(lifted, kinds, degree)
-    wanted = conditions(scaled_targets(targets, scale), kinds, 1)
+    moments, weights, scale = ring_moments(lifted, kinds, degree, emphasis)
+    wanted = conditions(scaled_targets(targets, scale, emphasis), kinds, 1)
     rest = xp.zeros((targets.shape[0], moments.shape[0] - 5, wanted.shape[2]), dtype=lifted.dtype)
     wanted = xp.concatenate([wanted, rest], axis=1)
     c = _least_norm(moments, weights, wanted)
@@ -126,7 +128,7 @@ def covariant(height: Float[AnyArray, "5 N"], weights: Float[AnyArray, "5 K N"])
 
 
 def ring_moments(
-    lifted: Float[AnyArray, "K N 2"], kinds: Int[AnyArray, " N"], degree: int
+    lifted: Float[AnyArray, "K N 2"], kinds: Int[AnyArray, " N"], degree: int, emphasis: float = 1.0
 ) -> tuple[Float[AnyArray, "M K N"], Float[AnyArray, "K N"], Float[AnyArray, " N"]]:
     """The moments (M, K, N) of the ring scaled to mean square radius one, the weights of the fit, and the scale."""
     xp = lifted.__array_namespace__()
@@ -137,15 +139,17 @@ def ring_moments(
     scale = xp.sqrt(xp.where(mean_square > 0, mean_square, 1))
     x, y = lifted[..., 0] / scale[None], lifted[..., 1] / scale[None]
     weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0)
-    moments = conditions(xp.stack([x, y, x * y, x**2, y**2]), kinds, 0)
+    moments = conditions(xp.stack([emphasis * x, emphasis * y, x * y, x**2, y**2]), kinds, 0)
     further = [x ** (n - k) * y**k for n in range(3, degree + 1) for k in range(n + 1)]
     return xp.concatenate([moments, xp.stack(further)]) if further else moments, weights, scale
 
 
-def scaled_targets(targets: Float[AnyArray, "R 5 #N"], scale: Float[AnyArray, " N"]) -> Float[AnyArray, "R 5 N"]:
-    """Targets for weights that are multiplied by scale^2, of rings that are divided by scale."""
+def scaled_targets(
+    targets: Float[AnyArray, "R 5 #N"], scale: Float[AnyArray, " N"], emphasis: float = 1.0
+) -> Float[AnyArray, "R 5 N"]:
+    """The targets in the terms of `ring_moments`: for weights times scale^2, on rings divided by scale."""
     xp = targets.__array_namespace__()
-    factors = xp.stack([scale, scale, *[xp.ones_like(scale)] * 3])
+    factors = xp.stack([emphasis * scale] * 2 + [xp.ones_like(scale)] * 3)
     return targets * factors[None]
 
 
@@ -182,13 +186,12 @@ def _least_norm(
     xp = moments.__array_namespace__()
     matrix = moment_matrix(moments, weights)
     size, eps = matrix.shape[0], xp.finfo(matrix.dtype).eps
-    diagonal = xp.einsum("iin->in", matrix)
-    unscaled = 1 / xp.sqrt(xp.where(diagonal > 0, diagonal, 1))
+    mean = xp.trace(matrix) / size
+    unscaled = 1 / xp.where(mean > 0, mean, 1)
     # Small enough for the refinement to restore full accuracy, large enough that a matrix without full rank (four
     # neighbours, a mirrored ring) does not magnify rounding.
     ridge = eps ** (2 / 3) * xp.eye(size, dtype=matrix.dtype)[..., None]
-    inverse = _inverse(matrix * unscaled[:, None] * unscaled[None] + ridge)
-    inverse = inverse * unscaled[:, None] * unscaled[None]
+    inverse = _inverse(matrix * unscaled[None, None] + ridge) * unscaled[None, None]
     weighted = moments * weights[None]
     c = xp.zeros((targets.shape[0], *weights.shape), dtype=weights.dtype)
     for _ in range(1 + _REFINEMENTS):
@@ -198,7 +201,7 @@ def _least_norm(
 
 
 def _inverse(matrix: Float[AnyArray, "M M N"]) -> Float[AnyArray, "M M N"]:
-    """The inverses of symmetric positive definite matrices of unit diagonal, one for every vertex at once."""
+    """The inverses of symmetric positive definite matrices of mean diagonal one, one for every vertex at once."""
     return _sweep(matrix) if isinstance(matrix, np.ndarray) else _differentiable_inverse(matrix)
 
 

@@ -72,6 +72,24 @@ def centroid_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) 
     return unit(xp.sum(xp.where(has_face, weight, 0)[..., None] * face_normals, axis=0))
 
 
+def inverted_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) -> Float[AnyArray, "N 3"]:
+    """Unit normals: the sum over faces of a x b / (|a|^2 |b|^2), a and b the edges at the vertex. First order.
+
+    Exact where the ring lies on a sphere. The side is that of the sum of a x b, the vector area of the ring, which does
+    not change when the vertex moves inside or even out of its ring and folds some faces over.
+
+    Source: Max (1999), Weights for computing vertex normals from facet normals, doi:10.1080/10867651.1999.10487501.
+    """
+    xp = offsets.__array_namespace__()
+    squared = xp.sum(offsets**2, axis=-1, keepdims=True)
+    largest = xp.max(squared, axis=0)[None]
+    inverted = offsets * xp.where(squared > 0, largest / xp.where(squared > 0, squared, 1), 0)
+    following = take_slots(inverted, topology.following(offsets.shape[0]))
+    normals = unit(xp.sum(xp.cross(inverted, following), axis=0))
+    area = xp.sum(xp.cross(offsets, take_slots(offsets, topology.following(offsets.shape[0]))), axis=0)
+    return normals * xp.where(xp.sum(normals * area, axis=-1, keepdims=True) < 0, -1, 1).astype(normals.dtype)
+
+
 def lifted_ring(
     offsets: Float[AnyArray, "K N 3"], frames: Float[AnyArray, "N 2 3"], lift: Lift
 ) -> Float[AnyArray, "K N 2"]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ..tables import AnyArray, Block, Table, slot_sum
 from . import jets, paper
 from .frames import boundary_frames, corner_conormals, tangent_frames, transport
-from .ring import Lift, RingTopology, centroid_normals, last_slot, lifted_ring, take_slots
+from .ring import Lift, RingTopology, centroid_normals, inverted_normals, last_slot, lifted_ring, take_slots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,10 +135,11 @@ _PARALLEL = 0.1
 
 
 def ring_normals(
-    vertices: Float[AnyArray, "V 3"], ring: Table, ring_blocks: tuple[RingTopology, ...]
+    scheme: Scheme, vertices: Float[AnyArray, "V 3"], ring: Table, ring_blocks: tuple[RingTopology, ...]
 ) -> Float[AnyArray, "V 3"]:
-    """The paper's centroid-weighted unit normals."""
-    return ring.map(lambda block, topology: centroid_normals(offsets(vertices, block), topology), ring_blocks)
+    """The unit normals a scheme starts from: first order. `Paper` weighs faces by their centroids, and stays there."""
+    mean = centroid_normals if isinstance(scheme, Paper) else inverted_normals
+    return ring.map(lambda block, topology: mean(offsets(vertices, block), topology), ring_blocks)
 
 
 def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
@@ -181,7 +182,7 @@ def vertex_frames(
 
 def weigh(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Geometry:
     """All weights of a scheme, a pure function of the positions."""
-    normals = ring_normals(vertices, topology.ring, topology.ring_blocks)
+    normals = ring_normals(scheme, vertices, topology.ring, topology.ring_blocks)
     if not isinstance(scheme, Paper):
         normals = fitted_normals(vertices, normals, topology.jet, scheme.degree)
     return weigh_in_frames(scheme, vertices, topology, normals, *vertex_frames(vertices, normals, topology))

@@ -105,6 +105,7 @@ def nonnegative_support(
     k_ring: KRing,
     lift_at: LiftAt,
     watch: Watch,
+    emphasis: float = 1.0,
 ) -> tuple[Rows, SupportRecord]:
     """Rows on which the weights of an operator are non-negative: the one-ring, else what least squares picks.
 
@@ -120,6 +121,7 @@ def nonnegative_support(
         k_ring: the wider rings.
         lift_at: the lifted coordinates of neighbours.
         watch: shows how far the choice has come.
+        emphasis: as in `jets.operator_weights`.
     """
     num_vertices = len(is_good)
     rows = rings
@@ -130,7 +132,7 @@ def nonnegative_support(
         found = _Found()
         for batch, candidates in _candidates(wanting, rings, ring, k_ring, watch):
             lifted = lift_at(batch, candidates)
-            is_picked, residual = _nonnegative_rows(lifted, kinds[batch], targets[:, batch])
+            is_picked, residual = _nonnegative_rows(lifted, kinds[batch], targets[:, batch], emphasis)
             is_better = residual < record.residual[batch]
             here = batch[is_better]
             record.rings[here], record.residual[here] = ring, residual[is_better]
@@ -140,7 +142,9 @@ def nonnegative_support(
     return rows, record
 
 
-def _nonnegative_rows(lifted: np.ndarray, kinds: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nonnegative_rows(
+    lifted: np.ndarray, kinds: np.ndarray, targets: np.ndarray, emphasis: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The neighbours least squares picks from lifted candidates (K, N, 2), as a mask (K, N), and the residuals (N,)."""
     is_picked = np.sum(lifted**2, axis=-1) > 0
     residual = np.ones(len(kinds))
@@ -148,8 +152,8 @@ def _nonnegative_rows(lifted: np.ndarray, kinds: np.ndarray, targets: np.ndarray
     # scale is of no account and one pass is enough; elsewhere the passes settle on the row that the weights recompute.
     todo = np.flatnonzero(is_picked.any(axis=0))
     for _ in range(LARGEST_RING):
-        moments, weights, scale = ring_moments(np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2)
-        target = conditions(scaled_targets(targets[None, :, todo], scale), kinds[todo], 1)[0]
+        moments, weights, scale = ring_moments(np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2, emphasis)
+        target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
         columns = weights**2
         matrices = np.ascontiguousarray(np.moveaxis(moments * columns[None], -1, 0))
         c = np.zeros(columns.shape)
