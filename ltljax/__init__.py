@@ -10,7 +10,7 @@ equations are made of operators; `solve` carries them through time.
 
 from importlib.metadata import version as _version
 
-from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
+from .equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
 from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
 from .operators import (
@@ -33,14 +33,17 @@ __all__ = [
     "RKC2",
     "Curvature",
     "Diffusion",
+    "Dirichlet",
     "Equation",
     "InconsistentRowsWarning",
     "Mesh",
     "MeshError",
     "Monotone",
+    "Neumann",
     "Paper",
     "Polynomial",
     "ReactionDiffusion",
+    "Robin",
     "Solution",
     "SolveError",
     "Surface",

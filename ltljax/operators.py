@@ -93,27 +93,32 @@ def laplacian(
     _check_rows(surface, u, "u")
     table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
     if table is None or weights is None:
-        if flux is not None:
-            raise ValueError("Paper() knows of no flux through a boundary. Use ltl.Monotone() or ltl.Polynomial().")
-        return _divergence_in_frame(surface, *_gradient_in_frame(surface, u))
-    rate = difference_sum(table, weights, u)
-    return rate if flux is None else add_flux(surface, rate, u, jnp.asarray(flux, u.dtype))
+        rate = _divergence_in_frame(surface, *_gradient_in_frame(surface, u))
+    else:
+        rate = difference_sum(table, weights, u)
+    return rate if flux is None else add_flux(surface, rate, through_sides(surface, jnp.asarray(flux, u.dtype), u))
+
+
+def through_sides(
+    surface: Surface, flux: Float[Array, "V *C"], u: Float[AnyArray, "V *S"]
+) -> Float[Array, "2 B *S"]:
+    """The flux of u through both sides of every boundary vertex, from one flux or from a gradient: see `laplacian`."""
+    here = flux[surface.topology.boundary]
+    if flux.shape == u.shape:
+        return jnp.broadcast_to(here[None], (2, *here.shape))
+    if flux.shape != (*u.shape, 3):
+        raise ValueError(f"Expected a flux of shape {u.shape}, or {(*u.shape, 3)} for a gradient, found {flux.shape}.")
+    return jnp.einsum("b...c,bsc->sb...", here, surface.geometry.conormals)
 
 
 def add_flux(
-    surface: Surface, rate: Float[Array, "V *S"], u: Float[AnyArray, "V *S"], flux: Float[Array, "..."]
+    surface: Surface, rate: Float[Array, "V *S"], through: Float[Array, "2 B *S"]
 ) -> Float[Array, "V *S"]:
-    """What a flux through the boundary adds to the Laplacian of u: see `laplacian`."""
-    if flux.shape not in (u.shape, (*u.shape, 3)):
-        raise ValueError(f"Expected a flux of shape {u.shape}, or {(*u.shape, 3)} for a gradient, found {flux.shape}.")
-    boundary, conormals = surface.topology.boundary, surface.geometry.conormals
-    here = flux[boundary]
-    if flux.ndim > u.ndim:
-        through = jnp.einsum("b...c,bsc->sb...", here, conormals)
-    else:
-        through = jnp.broadcast_to(here[None], (2, *here.shape))
-    through = jnp.einsum("sb...,bs->b...", through, surface.geometry.flux_weights)
-    return rate.at[boundary].add(through, unique_indices=True)
+    """The Laplacian with what fluxes through the sides of boundary vertices add to it."""
+    if surface.geometry.flux_weights is None:
+        raise ValueError("Paper() knows of no flux through a boundary. Use ltl.Monotone() or ltl.Polynomial().")
+    added = jnp.einsum("sb...,bs->b...", through, surface.geometry.flux_weights)
+    return rate.at[surface.topology.boundary].add(added, unique_indices=True)
 
 
 @eqx.filter_jit

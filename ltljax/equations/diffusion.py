@@ -2,38 +2,49 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..operators import laplacian, spectral_bound
+from ..operators import spectral_bound
 from ..surface import Surface
+from . import boundary as bounds
+from .boundary import Conditions
 from .equation import Equation
 
 Source = Float[Array, "V *S"] | Callable[[Float[Array, ""], Float[Array, "V 3"]], Float[Array, "V *S"]]
 
 
 class Diffusion(Equation):
-    """u_t = D Delta u + g on a surface; on a boundary the normal derivative of u vanishes.
+    """u_t = D Delta u + g on a surface.
 
     Attributes:
         diffusivity: D, a positive number; for a state (V, S) also one number for each species, (S,).
         source: g: None, an array like the state, or a function ``(t, vertices) -> array``.
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivative vanishes.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 3.
     """
 
     diffusivity: Float[Array, "*S"] | float = 1.0
     source: Source | None = None
+    boundary: Conditions = eqx.field(default=(), converter=bounds.as_tuple)
 
     def rate(self, t, surface: Surface, u):
-        """The time derivative D Delta u + g."""
+        """The time derivative D Delta u + g; of a value that is held, that value's."""
+        u = self.held(t, surface, u)
         diffusivity = jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
-        rate = diffusivity[None] * laplacian(surface, u)
-        if self.source is None:
-            return rate
-        source = self.source(t, surface.vertices) if callable(self.source) else self.source
-        return rate + jnp.asarray(source, u.dtype)
+        rate = diffusivity[None] * bounds.bounded_laplacian(surface, self.boundary, t, u)
+        if self.source is not None:
+            source = self.source(t, surface.vertices) if callable(self.source) else self.source
+            rate = rate + jnp.asarray(source, u.dtype)
+        return bounds.held_rate(surface, self.boundary, t, u, rate)
+
+    def held(self, t, surface: Surface, u):
+        """The state with the values that the boundary conditions hold."""
+        return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
         """The largest diffusivity times the bound of the Laplacian's eigenvalues."""
-        return jnp.max(jnp.asarray(self.diffusivity, u.dtype)) * spectral_bound(surface)
+        bound = spectral_bound(surface) + bounds.stiffness(surface, self.boundary, t, u)
+        return jnp.max(jnp.asarray(self.diffusivity, u.dtype)) * bound

@@ -18,3 +18,8 @@ class Equation(eqx.Module):
     @abc.abstractmethod
     def spectral_bound(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
         """An upper bound of the magnitude of the eigenvalues of the rate's derivative at the state."""
+
+    def held(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
+        """The state with the values that boundary conditions hold; the state itself where there are none."""
+        del t, surface
+        return u

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
@@ -163,6 +164,7 @@ def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractPr
 
 @eqx.filter_jit
 def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, max_steps) -> Solution:
+    u0 = equation.held(t0, surface, u0)
     largest = _OVERFLOW * jnp.maximum(1, jnp.max(jnp.abs(u0)))
 
     # Not "is too large": a NaN compares false with everything.
@@ -191,6 +193,9 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
         progress_meter=meter,
     )
     (ts, t_end), (us, u_end) = cast(Any, out.ts), cast(Any, out.ys)
+    # The integrated rate of a held value ends near the value; what is handed out is the value.
+    us = jax.vmap(lambda t, u: equation.held(t, surface, u))(ts, us)
+    u_end = jax.vmap(lambda t, u: equation.held(t, surface, u))(t_end, u_end)
     stats = {name: out.stats[name] for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     if keeps_state:
         stats["num_evaluations"] = cast(Any, out.solver_state)[1]

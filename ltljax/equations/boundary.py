@@ -1,0 +1,179 @@
+"""What holds on the boundary of a surface: conditions as values, and what they do to a diffusion.
+
+What enters: conditions, the time and the state. What leaves: the fluxes they let through, and the values they hold.
+Where nothing is said the normal derivative vanishes. Of two conditions for the same vertex the later one holds.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..operators import add_flux, laplacian, through_sides
+from ..surface import Surface
+
+# None for the whole boundary, the number of a boundary loop (as in mesh.boundary_loops), a mask (V,), or a predicate
+# ``vertices (V, 3) -> (V,)``.
+Where = None | int | Bool[Array, " V"] | Callable[[Float[Array, "V 3"]], Bool[Array, " V"]]
+# A number, an array that fits the state, or a function ``(t, vertices) -> array``.
+Data = Any
+
+
+class Neumann(eqx.Module):
+    """du/dnu = flux on the boundary, nu the outward conormal.
+
+    Attributes:
+        flux: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these; also the gradient whose
+            part along the conormal is meant, (V, 3) or (V, S, 3), which serves both sides of a corner.
+        where: None for the whole boundary, the number of a loop in ``mesh.boundary_loops``, a mask (V,), or a predicate
+            ``vertices (V, 3) -> (V,)``.
+    """
+
+    flux: Data = 0.0
+    where: Where = None
+
+
+class Dirichlet(eqx.Module):
+    """u = value on the boundary; with a mask also at vertices inside.
+
+    Attributes:
+        value: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these.
+        where: as of `Neumann`.
+    """
+
+    value: Data = 0.0
+    where: Where = None
+
+
+class Robin(eqx.Module):
+    """a u + b du/dnu = g on the boundary, nu the outward conormal. Diffusion stays stable where a / b >= 0.
+
+    Attributes:
+        a: as the values of `Dirichlet`.
+        b: as the values of `Dirichlet`; not zero.
+        g: as the values of `Dirichlet`.
+        where: as of `Neumann`.
+    """
+
+    a: Data = 1.0
+    b: Data = 1.0
+    g: Data = 0.0
+    where: Where = None
+
+
+Condition = Neumann | Dirichlet | Robin
+Conditions = Condition | tuple[Condition, ...]
+
+
+def as_tuple(conditions: Conditions | list[Condition] | None) -> tuple[Condition, ...]:
+    """The conditions as a tuple."""
+    if conditions is None:
+        return ()
+    conditions = tuple(conditions) if isinstance(conditions, tuple | list) else (conditions,)
+    for condition in conditions:
+        if not isinstance(condition, Condition):
+            raise TypeError(f"Expected ltl.Neumann, ltl.Dirichlet or ltl.Robin, found {condition!r}.")
+    return conditions
+
+
+def bounded_laplacian(
+    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "V *S"]:
+    """The Laplacian of a state that keeps the conditions, with the fluxes they let through."""
+    rate = laplacian(surface, u)
+    if not any(isinstance(condition, Neumann | Robin) for condition in conditions):
+        return rate
+    boundary = surface.topology.boundary
+    through = jnp.zeros((2, boundary.shape[0], *u.shape[1:]), u.dtype)
+    for condition in conditions:
+        if isinstance(condition, Neumann):
+            flux = through_sides(surface, _data(condition.flux, t, surface, u, may_be_gradient=True), u)
+        elif isinstance(condition, Robin):
+            a, b, g = (_data(data, t, surface, u) for data in (condition.a, condition.b, condition.g))
+            flux = through_sides(surface, (g - a * u) / b, u)
+        else:
+            continue
+        here = _mask(condition.where, surface)[boundary].reshape(1, -1, *(1,) * (u.ndim - 1))
+        through = jnp.where(here, flux, through)
+    return add_flux(surface, rate, through)
+
+
+def held(
+    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "V *S"]:
+    """The state with the values that Dirichlet conditions hold."""
+    for condition in _dirichlet(conditions):
+        u = _where(condition, surface, _data(condition.value, t, surface, u), u)
+    return u
+
+
+def held_rate(
+    surface: Surface,
+    conditions: tuple[Condition, ...],
+    t: Float[Array, ""],
+    u: Float[Array, "V *S"],
+    rate: Float[Array, "V *S"],
+) -> Float[Array, "V *S"]:
+    """The rate of change, where Dirichlet conditions hold the state that of their values."""
+    for condition in _dirichlet(conditions):
+        at = jnp.asarray(t, u.dtype)
+        _, change = jax.jvp(lambda s, c=condition: _data(c.value, s, surface, u), (at,), (jnp.ones_like(at),))
+        rate = _where(condition, surface, change, rate)
+    return rate
+
+
+def stiffness(
+    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, ""]:
+    """A bound of what Robin conditions add to the eigenvalues of the Laplacian."""
+    bound = jnp.zeros((), u.dtype)
+    for condition in conditions:
+        if isinstance(condition, Robin):
+            ratio = _data(condition.a, t, surface, u) / _data(condition.b, t, surface, u)
+            ratio = jnp.where(_mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1)), ratio, 0)
+            added = add_flux(surface, jnp.zeros_like(u), through_sides(surface, jnp.abs(ratio), u))
+            bound = jnp.maximum(bound, jnp.max(jnp.abs(added)))
+    return bound
+
+
+def _dirichlet(conditions):
+    return [condition for condition in conditions if isinstance(condition, Dirichlet)]
+
+
+def _where(condition: Condition, surface: Surface, inside: Array, outside: Array) -> Array:
+    return jnp.where(_mask(condition.where, surface).reshape(-1, *(1,) * (outside.ndim - 1)), inside, outside)
+
+
+def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:
+    """The vertices a condition is for."""
+    topology = surface.topology
+    size = surface.num_vertices
+    everywhere = jnp.zeros(size, bool).at[topology.boundary].set(True)
+    if where is None:
+        return everywhere
+    if isinstance(where, int):
+        return jnp.zeros(size, bool).at[topology.boundary].set(topology.loops == where)
+    mask = where(surface.vertices) if callable(where) else jnp.asarray(where)
+    if mask.shape != (size,) or mask.dtype != bool:
+        raise ValueError(f"Expected `where` to give booleans of shape ({size},), found {mask.dtype} {mask.shape}.")
+    return mask & everywhere if callable(where) else mask
+
+
+def _data(data: Data, t, surface: Surface, u: Array, *, may_be_gradient: bool = False) -> Array:
+    """The data of a condition at a time, in the shape of the state (or of its gradient)."""
+    values = jnp.asarray(data(t, surface.vertices) if callable(data) else data, u.dtype)
+    if may_be_gradient and values.shape == (*u.shape, 3):
+        return values
+    if values.shape == u.shape[:1] and u.ndim == 2:
+        return jnp.broadcast_to(values[:, None], u.shape)
+    if values.shape in ((), u.shape[1:]):
+        return jnp.broadcast_to(values.reshape((1,) * (u.ndim - values.ndim) + values.shape), u.shape)
+    if values.shape != u.shape:
+        raise ValueError(
+            f"Expected boundary data as a number or of shape {u.shape}{f' or {u.shape[:1]}' * (u.ndim - 1)}"
+            f"{f' or {(*u.shape, 3)}' * may_be_gradient}, found {values.shape}."
+        )
+    return values
