@@ -10,6 +10,7 @@ equations are made of operators; `solve` carries them through time.
 
 from importlib.metadata import version as _version
 
+from .elliptic import EllipticStencil, elliptic_stencil
 from .equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
 from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
@@ -18,13 +19,14 @@ from .operators import (
     curvature,
     divergence,
     gradient,
+    growth_rate,
     hessian,
     integrate,
     laplacian,
     laplacian_matrix,
     weighted_laplacian,
 )
-from .solve import RKC2, Solution, SolveError, solve
+from .solve import RKC2, GrowingModesWarning, Solution, SolveError, solve
 from .surface import InconsistentRowsWarning, Surface
 
 __version__ = _version("ltljax")
@@ -34,7 +36,9 @@ __all__ = [
     "Curvature",
     "Diffusion",
     "Dirichlet",
+    "EllipticStencil",
     "Equation",
+    "GrowingModesWarning",
     "InconsistentRowsWarning",
     "Mesh",
     "MeshError",
@@ -49,7 +53,9 @@ __all__ = [
     "Surface",
     "curvature",
     "divergence",
+    "elliptic_stencil",
     "gradient",
+    "growth_rate",
     "hessian",
     "integrate",
     "kinetics",

@@ -9,11 +9,13 @@ import functools
 import warnings
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .conservation import stationary_measure
@@ -108,9 +110,7 @@ class Surface(eqx.Module):
     report: SurfaceReport = eqx.field(static=True)
 
     @classmethod
-    def from_mesh(
-        cls, mesh: Mesh, scheme: Scheme | None = None, dtype=None, progress: bool = False
-    ) -> "Surface":
+    def from_mesh(cls, mesh: Mesh, scheme: Scheme | None = None, dtype=None, progress: bool = False) -> "Surface":
         """The surface of a mesh.
 
         Weights are computed in float64 and cast last.
@@ -148,7 +148,8 @@ class Surface(eqx.Module):
             )
         if len(report.inconsistent):
             warnings.warn(_inconsistent(report), InconsistentRowsWarning, stacklevel=2)
-        return cls(*jax.tree.map(jnp.asarray, (topology, geometry)), scheme, report)
+        topology, geometry = jax.tree.map(jnp.asarray, (topology, geometry))
+        return cls(topology, geometry, scheme, report)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with its vertices moved and every weight computed anew, on the same support.
@@ -199,17 +200,31 @@ class Surface(eqx.Module):
         weights, diffusion = self.geometry.laplacian_weights, self.topology.diffusion
         if not isinstance(self.scheme, Monotone) or weights is None or diffusion is None:
             raise ValueError(f"Only Monotone() has non-negative weights and so a conserved measure, not {self.scheme}.")
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self.geometry)):
+        if self.is_traced:
             raise ValueError(
                 "The mass is computed on the host, but the surface is being traced by a JAX transformation. Take "
                 "`mass = surface.mass` outside and hand it in as an argument."
             )
-        key = id(weights[0])
-        if key not in _MASSES:
-            areas = np.asarray(self.vertex_areas)
-            _MASSES[key] = jnp.asarray(stationary_measure(difference_matrix(diffusion, weights), areas), self.dtype)
-            weakref.finalize(weights[0], _MASSES.pop, key, None)
-        return _MASSES[key]
+        return self.remembered("mass", lambda: self._stationary_measure(difference_matrix(diffusion, weights)))
+
+    def _stationary_measure(self, generator) -> Float[Array, " V"]:
+        return jnp.asarray(stationary_measure(generator, np.asarray(self.vertex_areas)), self.dtype)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether a JAX transformation is tracing the surface, so that its numbers are not known yet."""
+        return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.geometry))
+
+    def remembered(self, name: str, compute: Callable[[], Any]) -> Any:
+        """What ``compute`` returns, computed once for these positions and kept on the host as long as they live."""
+        key = id(self.vertices)
+        if key not in _REMEMBERED:
+            _REMEMBERED[key] = {}
+            weakref.finalize(self.vertices, _REMEMBERED.pop, key, None)
+        kept = _REMEMBERED[key]
+        if name not in kept:
+            kept[name] = compute()
+        return kept[name]
 
     @property
     def num_vertices(self) -> int:
@@ -224,8 +239,8 @@ class Surface(eqx.Module):
 
 _weigh = eqx.filter_jit(weigh)
 
-# By the identity of the weights they belong to, for as long as those live.
-_MASSES: dict[int, Array] = {}
+# Results on the host, by the identity of the array of positions they belong to, for as long as that lives.
+_REMEMBERED: dict[int, dict[str, Any]] = {}
 
 
 def _inconsistent(report: SurfaceReport) -> str:

@@ -18,6 +18,7 @@ MAY_IMPORT = {
     "lifting": {"tables"},
     "surface": {"mesh", "lifting", "tables", "progress", "conservation"},
     "operators": {"surface", "tables"},
+    "elliptic": {"surface", "lifting", "mesh", "tables", "progress"},
     "equations": {"operators", "surface", "tables"},
     "solve": {"equations", "operators", "surface", "tables", "lifting"},
     "output": set(),

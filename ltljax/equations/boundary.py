@@ -80,10 +80,11 @@ def as_tuple(conditions: Conditions | list[Condition] | None) -> tuple[Condition
 
 
 def bounded_laplacian(
-    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "V *S"]:
     """The Laplacian of a state that keeps the conditions, with the fluxes they let through."""
     rate = laplacian(surface, u)
+    conditions = as_tuple(conditions)
     if not any(isinstance(condition, Neumann | Robin) for condition in conditions):
         return rate
     boundary = surface.topology.boundary
@@ -102,7 +103,7 @@ def bounded_laplacian(
 
 
 def held(
-    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "V *S"]:
     """The state with the values that Dirichlet conditions hold."""
     for condition in _dirichlet(conditions):
@@ -112,7 +113,7 @@ def held(
 
 def held_rate(
     surface: Surface,
-    conditions: tuple[Condition, ...],
+    conditions: Conditions,
     t: Float[Array, ""],
     u: Float[Array, "V *S"],
     rate: Float[Array, "V *S"],
@@ -126,11 +127,11 @@ def held_rate(
 
 
 def stiffness(
-    surface: Surface, conditions: tuple[Condition, ...], t: Float[Array, ""], u: Float[Array, "V *S"]
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, ""]:
     """A bound of what Robin conditions add to the eigenvalues of the Laplacian."""
     bound = jnp.zeros((), u.dtype)
-    for condition in conditions:
+    for condition in as_tuple(conditions):
         if isinstance(condition, Robin):
             ratio = _data(condition.a, t, surface, u) / _data(condition.b, t, surface, u)
             ratio = jnp.where(_mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1)), ratio, 0)
@@ -139,8 +140,8 @@ def stiffness(
     return bound
 
 
-def _dirichlet(conditions):
-    return [condition for condition in conditions if isinstance(condition, Dirichlet)]
+def _dirichlet(conditions: Conditions) -> list[Dirichlet]:
+    return [condition for condition in as_tuple(conditions) if isinstance(condition, Dirichlet)]
 
 
 def _where(condition: Condition, surface: Surface, inside: Array, outside: Array) -> Array:

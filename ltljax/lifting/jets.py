@@ -6,7 +6,8 @@ d/dx, (0, 0, 0, 2, 2) for the Laplacian; and zero for every further monomial of 
 those of least ``sum c^2 / w`` are taken, w falling with the distance: the rows of the least-squares fit of a polynomial
 through the vertex with weights w. The first and second derivatives of the fit are the jet of the field.
 
-Source: the configuration equation of Wu, Chen and Chi, arXiv 1310.4807; here as a constrained least norm, of any degree.
+Source: the configuration equation of Wu, Chen and Chi, arXiv 1310.4807; here as a constrained least norm, of any
+degree.
 """
 
 import jax
@@ -58,7 +59,7 @@ def operator_weights(
         emphasis: how much more the conditions on sum c x and sum c y count where not all can be met.
 
     Returns:
-        The weights, and the largest error of a condition over the largest target, zero to rounding where a row is exact.
+        The weights, and the largest error of a condition over the largest target: rounding, where a row is exact.
     """
     xp = lifted.__array_namespace__()
     moments, weights, scale = ring_moments(lifted, kinds, degree, emphasis)
@@ -68,9 +69,7 @@ def operator_weights(
     c = _least_norm(moments, weights, wanted)
     if nonnegative:
         c = xp.maximum(c, 0)
-    size = xp.max(xp.abs(wanted), axis=1)
-    error = xp.max(xp.abs(wanted - _apply_moments(moments, c)), axis=1)
-    return c / scale[None, None] ** 2, error / xp.where(size > 0, size, 1)
+    return c / scale[None, None] ** 2, relative_residual(wanted, _apply_moments(moments, c), emphasis)
 
 
 def jet_weights(lifted: Float[AnyArray, "K N 2"], degree: int) -> Float[AnyArray, "5 K N"]:
@@ -153,6 +152,20 @@ def scaled_targets(
     return targets * factors[None]
 
 
+def relative_residual(
+    wanted: Float[AnyArray, "R M N"], found: Float[AnyArray, "R M N"], emphasis: float = 1.0
+) -> Float[AnyArray, "R N"]:
+    """The largest error of a moment over the largest target of the row, both without the emphasis."""
+    xp = wanted.__array_namespace__()
+
+    def largest(values):
+        first, rest = xp.max(xp.abs(values[:, :2]), axis=1) / emphasis, xp.max(xp.abs(values[:, 2:]), axis=1)
+        return xp.maximum(first, rest)
+
+    size = largest(wanted)
+    return largest(wanted - found) / xp.where(size > 0, size, 1)
+
+
 def conditions(values: AnyArray, kinds: Int[AnyArray, " N"], axis: int) -> AnyArray:
     """What a row of each kind is held to, from values over x, y, xy, x^2, y^2 along an axis; zero where it is not."""
     xp = values.__array_namespace__()
@@ -231,4 +244,3 @@ def _sweep(matrix):
         here = xp.asarray(2 * np.outer(identity[k], identity[k]))[..., None]
         matrix = matrix - row[:, None] * (row / pivot[None])[None] - here
     return -matrix
-

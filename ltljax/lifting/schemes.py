@@ -4,10 +4,10 @@ What enters: positions and `Topology`. What leaves: `Geometry`, a record of ever
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 import equinox as eqx
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..tables import AnyArray, Block, Table, slot_sum
 from . import jets, paper
@@ -215,22 +215,24 @@ def weigh_in_frames(
         return tuple(weights), tuple(xp.einsum("knc,knac->akn", there, block.neighbours(frames)))
 
     per_block = topology.jet.each(jet, *([topology.ring_blocks] if isinstance(scheme, Paper) else []))
-    derivatives = list(zip(*(weights for weights, _ in per_block), strict=True))
-    divergence = tuple(zip(*(weights for _, weights in per_block), strict=True))
-    centre = [
-        slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, derivatives[:2], strict=True)
-    ]
+    x, y, *second = zip(*(weights for weights, _ in per_block), strict=True)
+    gradient = (x, y)
+    along_x, along_y = zip(*(weights for _, weights in per_block), strict=True)
+    divergence = (along_x, along_y)
+    centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, gradient, strict=True)]
     laplacian, residual, flux = None, None, None
     if topology.diffusion is not None:
-        laplacian, residual, first = diffusion_rows(scheme, vertices, normals, frames, topology.kinds, topology.diffusion)
+        laplacian, residual, first = diffusion_rows(
+            cast(Monotone | Polynomial, scheme), vertices, normals, frames, topology.kinds, topology.diffusion
+        )
         flux = _flux_weights(first[topology.boundary], frames[topology.boundary], conormals)
     return Geometry(
         vertices=vertices,
         normals=normals,
         frames=frames,
         vertex_areas=_vertex_areas(vertices, topology),
-        gradient_weights=tuple(derivatives[:2]),
-        hessian_weights=tuple(derivatives[2:]) or None,
+        gradient_weights=gradient,
+        hessian_weights=(second[0], second[1], second[2]) if second else None,
         divergence_weights=divergence,
         divergence_centre=xp.stack(centre, axis=-1),
         laplacian_weights=laplacian,
@@ -278,7 +280,9 @@ def _flux_weights(first, frames, conormals):
     determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     is_corner = xp.abs(determinant) > _PARALLEL
     safe = xp.where(is_corner, determinant, 1)
-    corner = xp.stack([first[:, 1] * b[:, 0] - first[:, 0] * b[:, 1], first[:, 0] * a[:, 1] - first[:, 1] * a[:, 0]], axis=-1)
+    corner = xp.stack(
+        [first[:, 1] * b[:, 0] - first[:, 0] * b[:, 1], first[:, 0] * a[:, 1] - first[:, 1] * a[:, 0]], axis=-1
+    )
     smooth = -first[:, 1:] / 2
     return xp.where(is_corner[:, None], corner / safe[:, None], smooth)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from scipy.optimize import nnls
 
-from .jets import conditions, moment_matrix, num_monomials, ring_moments, scaled_targets
+from .jets import conditions, moment_matrix, num_monomials, relative_residual, ring_moments, scaled_targets
 from .ring import Lift, lifted_ring
 
 # A ring determines a polynomial when the least eigenvalue of its moment matrix, scaled to unit diagonal, is this large.
@@ -152,16 +152,17 @@ def _nonnegative_rows(
     # scale is of no account and one pass is enough; elsewhere the passes settle on the row that the weights recompute.
     todo = np.flatnonzero(is_picked.any(axis=0))
     for _ in range(LARGEST_RING):
-        moments, weights, scale = ring_moments(np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2, emphasis)
+        moments, weights, scale = ring_moments(
+            np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2, emphasis
+        )
         target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
         columns = weights**2
         matrices = np.ascontiguousarray(np.moveaxis(moments * columns[None], -1, 0))
         c = np.zeros(columns.shape)
         for i, (matrix, right) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
             c[:, i] = nnls(matrix, right)[0]
-        size = np.abs(target).max(axis=0)
-        error = np.abs(np.einsum("ikn,kn->in", moments, columns * c) - target).max(axis=0)
-        residual[todo] = error / np.where(size > 0, size, 1)
+        reached = np.einsum("ikn,kn->in", moments, columns * c)
+        residual[todo] = relative_residual(target[None], reached[None], emphasis)[0]
         changed = np.any(is_picked[:, todo] != (c > 0), axis=0) & np.any(c > 0, axis=0)
         is_picked[:, todo] = c > 0
         todo = todo[changed & ~(residual[todo] <= CONSISTENT)]

@@ -1,5 +1,6 @@
 """`solve`: an equation, a surface and an initial state become a trajectory. The door to diffrax."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -11,13 +12,16 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ..equations import Equation
-from ..lifting.schemes import Paper
+from ..lifting.schemes import Paper, Polynomial
+from ..operators import growth_rate, spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
 from .chebyshev import RKC2
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
 _OVERFLOW = 1e6
+# Eigenvalues with a real part below this share of the largest magnitude count as rounding.
+_GROWTH = 1e-8
 
 
 class SolveError(RuntimeError):
@@ -32,6 +36,10 @@ class SolveError(RuntimeError):
         super().__init__(message)
         self.time = time
         self.solution = solution
+
+
+class GrowingModesWarning(UserWarning):
+    """The Laplacian of a surface has eigenvalues with positive real part, so that diffusion can grow."""
 
 
 class Solution(eqx.Module):
@@ -115,6 +123,10 @@ def solve(
     Raises:
         SolveError: the state overflowed, or the solver failed before t1.
         ValueError: the state does not fit the surface.
+
+    Warns:
+        GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
+            once for each surface, and not inside jit.
     """
     u0 = jnp.asarray(u0, surface.dtype)
     if u0.ndim not in (1, 2) or u0.shape[0] != surface.num_vertices:
@@ -122,6 +134,8 @@ def solve(
             f"Expected an initial state of shape ({surface.num_vertices},) or ({surface.num_vertices}, S), "
             f"found {u0.shape}."
         )
+    if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
+        _warn_of_growth(surface)
     # Time in the state's own float type: diffrax multiplies the two.
     time = surface.dtype
     ts = jnp.asarray([t1] if ts is None else ts, time)
@@ -139,6 +153,17 @@ def solve(
 def default_solver(surface: Surface) -> diffrax.AbstractSolver:
     """The solver `solve` takes by itself."""
     return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKC2(_bound)
+
+
+def _warn_of_growth(surface: Surface) -> None:
+    growth = surface.remembered("growth", lambda: growth_rate(surface))
+    if growth > _GROWTH * float(spectral_bound(surface)):
+        warnings.warn(
+            f"Modes of this Laplacian grow like exp({growth:.3g} t) under diffusion. {surface.scheme} is made for "
+            "stationary problems and good meshes: use ltl.Monotone() for time stepping, or a better mesh.",
+            GrowingModesWarning,
+            stacklevel=3,
+        )
 
 
 def _rate(t, u, args):
@@ -203,6 +228,8 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
 
 
 def _cause_of_overflow(surface: Surface) -> str:
+    if isinstance(surface.scheme, Polynomial):
+        return "Polynomial() has growing modes on bad meshes: use ltl.Monotone() for time stepping."
     if isinstance(surface.scheme, Paper):
         return "The published operator (scheme paper) has growing modes on such meshes: use ltl.Monotone()."
     return (

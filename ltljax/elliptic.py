@@ -1,0 +1,177 @@
+"""General second-order operators on a surface, by the same moments as the Laplacian, with non-negative weights.
+
+What enters: a surface, a tensor of diffusion and a field of drift. What leaves: an `EllipticStencil`, which applies
+``D : Hess u + b . grad u``, and whose weights are pure functions of D and b on frozen neighbours.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Float
+
+from .lifting import support
+from .lifting.jets import operator_weights
+from .lifting.ring import Lift, lifted_ring
+from .lifting.schemes import PerBlock, offsets
+from .mesh import k_ring, one_rings
+from .progress import watched
+from .surface import Surface
+from .tables import AnyArray, Table, build_table, difference_matrix, difference_sum
+
+# Where not every condition can be met the drift is to be exact, and the excess of diffusion the least.
+_EMPHASIS = 1e2
+
+
+class EllipticStencil(eqx.Module):
+    """The operator D : Hess u + b . grad u on a surface; call it on a field, (V,) or (V, S).
+
+    Attributes:
+        table: the neighbours.
+        weights: one array (K, N) per block of the table, non-negative.
+        residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
+        lift: how neighbours are laid into the tangent planes.
+    """
+
+    table: Table
+    weights: PerBlock
+    residual: Float[AnyArray, " V"]
+    lift: Lift = eqx.field(static=True)
+
+    def __call__(self, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
+        """The operator applied to u."""
+        return _apply(self, u)
+
+    def matrix(self) -> scipy.sparse.csr_array:
+        """The operator as a SciPy sparse matrix (V, V) (host)."""
+        return difference_matrix(self.table, self.weights)
+
+    def with_coefficients(
+        self, surface: Surface, diffusion: AnyArray, drift: AnyArray | None = None
+    ) -> "EllipticStencil":
+        """The stencil of other coefficients, or of a moved surface, on the same neighbours: pure and differentiable.
+
+        As good as the neighbours suit the new coefficients; ``residual`` tells.
+        """
+        targets = _targets(surface.geometry.frames, diffusion, drift)
+        weights, residual = _rows(surface.vertices, surface.geometry.frames, surface.topology.kinds, targets, self)
+        cast = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), (weights, residual))
+        return eqx.tree_at(lambda stencil: (stencil.weights, stencil.residual), self, cast)
+
+
+def elliptic_stencil(
+    surface: Surface,
+    diffusion: Float[AnyArray, "..."] | float,
+    drift: Float[AnyArray, "V 3"] | None = None,
+    progress: bool = False,
+) -> EllipticStencil:
+    """Non-negative weights for the operator D : Hess u + b . grad u (host).
+
+    Each row is the one-ring's where its weights are non-negative, else what non-negative least squares picks from two
+    and three rings. Pointwise first order, like the Laplacian. Where drift dominates (|b| h > 2 D) no non-negative row
+    meets both; then the drift is met and as little diffusion as possible is added, of the order |b| h: the row is
+    upwind. Where D is so anisotropic that three rings hold no consistent row, the row of least error is taken. Both
+    show in the residual. Such an operator has a maximum principle and no growing modes. On a boundary it is for fields
+    whose normal derivative vanishes.
+
+    For the divergence form div(D grad u) add the divergence of D to the drift; for a scalar D see `weighted_laplacian`.
+
+    Args:
+        surface: the surface.
+        diffusion: D, a number, (V,), or symmetric non-negative tensors (V, 3, 3), of which the tangent part counts.
+        drift: b, (V, 3), of which the tangent part counts.
+        progress: whether to show how far the choice of neighbours is.
+
+    Raises:
+        ValueError: D is not symmetric or not non-negative, a shape does not fit, or the surface is being traced.
+    """
+    if surface.is_traced:
+        raise ValueError(
+            "The neighbours of a stencil are chosen on the host, but the surface is being traced by a JAX "
+            "transformation. Build the stencil outside, and use its `with_coefficients` inside."
+        )
+    vertices, frames, kinds = (
+        np.asarray(a, a.dtype if a.dtype.kind == "i" else np.float64)
+        for a in jax.device_get((surface.vertices, surface.geometry.frames, surface.topology.kinds))
+    )
+    targets = _targets(frames, _checked(diffusion, frames), None if drift is None else np.asarray(drift, np.float64))
+    lift: Lift = "projection" if surface.scheme.lift == "projection" else "chord"
+    rings = one_rings(np.asarray(surface.faces), surface.num_vertices)
+    rows = (rings.offsets, rings.neighbours)
+    ring = EllipticStencil(build_table(*rows), (), np.zeros(0), lift)
+    _, residual = _rows(vertices, frames, kinds, targets, ring)
+    # Where some row meets every condition there is nothing to emphasise.
+    for emphasis in (1.0, _EMPHASIS):
+        rows, record = support.nonnegative_support(
+            rows,
+            residual <= support.CONSISTENT,
+            kinds,
+            targets[0],
+            lambda which, k: k_ring(rings, surface.num_vertices, which, k),
+            support.lift_onto(vertices, frames, lift),
+            watched("choosing the neighbours of the stencil", progress=progress),
+            emphasis,
+        )
+        residual = record.residual
+    stencil = EllipticStencil(build_table(*rows), (), np.zeros(0), lift)
+    weights, residual = _rows(vertices, frames, kinds, targets, stencil)
+    weights, residual = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), (weights, residual))
+    return EllipticStencil(jax.tree.map(jnp.asarray, stencil.table), weights, residual, lift)
+
+
+@eqx.filter_jit
+def _apply(stencil: EllipticStencil, u: AnyArray) -> Array:
+    return difference_sum(stencil.table, stencil.weights, u)
+
+
+def _checked(diffusion, frames: np.ndarray) -> np.ndarray:
+    tensor = np.asarray(diffusion, np.float64)
+    size = len(frames)
+    if tensor.shape not in ((), (size,), (size, 3, 3)):
+        raise ValueError(f"Expected a diffusion as a number, ({size},) or ({size}, 3, 3), found {tensor.shape}.")
+    if tensor.ndim == 3:
+        skew = np.abs(tensor - np.swapaxes(tensor, 1, 2)).max(axis=(1, 2)) > 1e-8 * np.abs(tensor).max()
+        if skew.any():
+            raise ValueError(f"The diffusion must be symmetric, but at vertex {np.flatnonzero(skew)[0]} it is not.")
+        least = np.linalg.eigvalsh(np.einsum("vac,vcd,vbd->vab", frames, tensor, frames))[:, 0]
+    else:
+        least = np.broadcast_to(tensor, size)
+    is_bad = ~(least >= -1e-10 * max(np.abs(tensor).max(), 1e-300))
+    if is_bad.any():
+        first = int(np.flatnonzero(is_bad)[0])
+        raise ValueError(
+            f"The diffusion must not be negative in any tangent direction, but at vertex {first} it is "
+            f"{least[first]:.3g}."
+        )
+    return tensor
+
+
+def _targets(frames: AnyArray, diffusion: AnyArray, drift: AnyArray | None) -> AnyArray:
+    """What the operator makes of x, y, xy, x^2 and y^2 in the frame of each vertex, (1, 5, V)."""
+    xp = frames.__array_namespace__()
+    diffusion = xp.asarray(diffusion, dtype=frames.dtype)
+    if diffusion.ndim == 3:
+        tensor = xp.einsum("vac,vcd,vbd->abv", frames, diffusion, frames)
+        xx, xy, yy = tensor[0, 0], tensor[0, 1], tensor[1, 1]
+    else:
+        xx = yy = xp.broadcast_to(diffusion, frames.shape[:1])
+        xy = xp.zeros_like(xx)
+    b = xp.zeros((2, frames.shape[0]), dtype=frames.dtype)
+    if drift is not None:
+        b = xp.einsum("vac,vc->av", frames, xp.asarray(drift, dtype=frames.dtype))
+    return xp.stack([b[0], b[1], 2 * xy, 2 * xx, 2 * yy])[None]
+
+
+def _rows(vertices, frames, kinds, targets, stencil: EllipticStencil) -> tuple[PerBlock, AnyArray]:
+    """The weights on the stencil's neighbours, and the residual of every row."""
+    table = stencil.table
+
+    def rows(block):
+        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), stencil.lift)
+        wanted = block.centre(targets[0].T).T[None]
+        c, residual = operator_weights(lifted, block.centre(kinds), wanted, nonnegative=True, emphasis=_EMPHASIS)
+        return c[0], residual[0]
+
+    weights, residuals = zip(*table.each(rows), strict=True)
+    return weights, table.rows_from(list(residuals))
