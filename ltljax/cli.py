@@ -9,6 +9,7 @@ from typing import NoReturn
 import jax
 
 from . import scenario
+from .lifting.schemes import Monotone, Paper, Polynomial, Scheme
 from .mesh import load_mesh
 from .run import run
 from .solve import SolveError
@@ -46,13 +47,24 @@ def _parser() -> argparse.ArgumentParser:
     run_ = commands.add_parser("run", help="solve a scenario and write pictures and data")
     run_.set_defaults(command=_run)
     run_.add_argument("scenario", choices=scenario.SCENARIOS, help="what to solve (see: ltljax list)")
-    run_.add_argument("--mesh", default="sphere", help="sphere, torus, or a mesh file (default: sphere)")
+    run_.add_argument("--mesh", default="sphere", help="sphere, torus, disk, or a mesh file (default: sphere)")
     run_.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
     run_.add_argument(
         "--source", choices=scenario.SOURCES, help="heat on the torus: the source (default: angle-zero-mean)"
     )
     run_.add_argument("--as-published", action="store_true", help="turing: the paper's parameters, which stay uniform")
-    run_.add_argument("--scheme", choices=("monotone", "paper"), default="monotone", help="default: monotone")
+    run_.add_argument(
+        "--scheme", choices=("monotone", "polynomial", "paper"), default="monotone", help="default: monotone"
+    )
+    run_.add_argument("--degree", type=int, choices=(3, 4), help="of the scheme polynomial (default: 4)")
+    run_.add_argument(
+        "--boundary",
+        action="append",
+        default=[],
+        metavar="CONDITION",
+        help="heat on an open mesh: neumann=FLUX, dirichlet=VALUE or robin=A,B,G (a u + b du/dnu = g), and @LOOP for "
+        "one boundary loop; may be given several times (default: neumann=0)",
+    )
     run_.add_argument("--t1", type=_positive, help="end of the run (default: the scenario's)")
     run_.add_argument("--frames", type=_count, default=60, help="states kept, evenly spaced in time (default: 60)")
     run_.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default: 0)")
@@ -109,11 +121,20 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
+def _scheme(options: argparse.Namespace) -> Scheme:
+    if options.scheme != "polynomial" and options.degree is not None:
+        raise ValueError(f"--degree {options.degree} needs --scheme polynomial.")
+    if options.scheme == "polynomial":
+        return Polynomial(options.degree or 4)
+    return Paper() if options.scheme == "paper" else Monotone()
+
+
 def _run(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", options.dtype == "float64")
     chosen = scenario.Options(
         mesh=options.mesh,
         source=options.source,
+        boundary=tuple(options.boundary),
         as_published=options.as_published,
         keep_scale=options.keep_scale,
         repair=options.repair,
@@ -121,5 +142,5 @@ def _run(options: argparse.Namespace) -> int:
         t1=options.t1,
     )
     example = scenario.SCENARIOS[options.scenario](chosen)
-    run(example, chosen, scheme=options.scheme, dtype=options.dtype, frames=options.frames, out=options.out)
+    run(example, chosen, scheme=_scheme(options), dtype=options.dtype, frames=options.frames, out=options.out)
     return 0

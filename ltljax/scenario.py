@@ -11,10 +11,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .equations import Diffusion, Equation, ReactionDiffusion, kinetics
+from .equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
+from .lifting.schemes import Monotone
 from .mesh import Mesh, load_mesh, shapes
+from .operators import integrate
+from .surface import Surface
 
-BUILT_IN = ("sphere", "torus")
+BUILT_IN = ("sphere", "torus", "disk")
 SOURCES = ("angle", "angle-zero-mean", "sine")
 _MAJOR, _MINOR = 2.0, 1.0
 
@@ -24,8 +27,9 @@ class Options:
     """What a user can choose about a scenario.
 
     Attributes:
-        mesh: ``"sphere"``, ``"torus"`` or the path of a mesh file.
+        mesh: one of `BUILT_IN` or the path of a mesh file.
         source: of `heat` on the torus, one of `SOURCES`.
+        boundary: of `heat` on an open mesh, conditions as `parse_condition` reads them.
         as_published: of `turing`, the paper's parameters in place of those that make a pattern.
         keep_scale: leave a mesh file's length scale alone.
         repair: mend a mesh file that is not acceptable.
@@ -35,6 +39,7 @@ class Options:
 
     mesh: str = "sphere"
     source: str | None = None
+    boundary: tuple[str, ...] = ()
     as_published: bool = False
     keep_scale: bool = False
     repair: bool = False
@@ -49,7 +54,7 @@ class Scenario:
     Attributes:
         name: its name.
         mesh: where; for files scaled as ``notes`` says.
-        make_equation: the equation, from the float type.
+        make_equation: the equation, from the surface of the mesh.
         u0: the initial state.
         t1: the end of the run.
         parameters: every parameter, for the record.
@@ -62,7 +67,7 @@ class Scenario:
 
     name: str
     mesh: Mesh
-    make_equation: Callable[[Any], Equation]
+    make_equation: Callable[[Surface], Equation]
     u0: np.ndarray
     t1: float
     parameters: dict[str, Any]
@@ -77,6 +82,8 @@ def heat(options: Options) -> Scenario:
     """u_t = Delta u + g from u = 0 (section 3): g = x1, or on the torus a function of the poloidal angle."""
     if options.as_published:
         raise ValueError("--as-published belongs to turing; for heat on the torus see --source angle.")
+    if options.boundary and options.mesh in ("sphere", "torus"):
+        raise ValueError(f"--boundary needs a mesh with a boundary; the {options.mesh} is closed.")
     if options.mesh == "torus":
         return _heat_on_torus(options)
     if options.source is not None:
@@ -91,11 +98,46 @@ def heat(options: Options) -> Scenario:
         )  # fmt: skip
     mesh, note = _from_file(options)
     x1 = mesh.vertices[:, 0]
-    areas = _vertex_areas(mesh)
+    conditions = tuple(parse_condition(text) for text in options.boundary)
+    if conditions and mesh.is_closed:
+        raise ValueError(f"--boundary needs a mesh with a boundary; {options.mesh} is closed.")
+    for text, condition in zip(options.boundary, conditions, strict=True):
+        if isinstance(condition.where, int) and condition.where >= len(mesh.boundary_loops):
+            count = len(mesh.boundary_loops)
+            raise ValueError(
+                f"--boundary {text}: expected a loop below {count}, the number of the mesh's boundary loops."
+            )
+    if conditions:
+        return _diffusion(options, mesh, x1, 5.0, "x1", notes=(note,), conditions=conditions)
     return _diffusion(
-        options, mesh, x1 - areas @ x1 / areas.sum(), 5.0, "x1 - mean(x1)",
+        options, mesh, x1, 5.0, "x1 - mean(x1)", takes_mean_off=True,
         notes=(note, "The mean of the source is taken off, so that a stationary state exists."),
     )  # fmt: skip
+
+
+def parse_condition(text: str) -> Neumann | Dirichlet | Robin:
+    """A boundary condition from ``neumann=FLUX``, ``dirichlet=VALUE`` or ``robin=A,B,G``, and ``@LOOP`` for one loop.
+
+    Raises:
+        ValueError: the text is none of these.
+    """
+    kinds = {"neumann": (Neumann, 1), "dirichlet": (Dirichlet, 1), "robin": (Robin, 3)}
+    name, _, rest = text.partition("=")
+    numbers, _, loop = rest.partition("@")
+    try:
+        make, count = kinds[name]
+        values = [float(number) for number in numbers.split(",")]
+        where = int(loop) if loop else None
+        if len(values) != count or not all(map(math.isfinite, values)) or (where is not None and where < 0):
+            raise ValueError
+        if make is Robin and values[1] == 0:
+            raise ValueError
+    except (KeyError, ValueError):
+        raise ValueError(
+            f"Expected neumann=FLUX, dirichlet=VALUE or robin=A,B,G (a u + b du/dnu = g, b not 0), with @LOOP for one "
+            f"boundary loop, such as dirichlet=1@0; found {text!r}."
+        ) from None
+    return make(*values, where=where)
 
 
 def _heat_on_torus(options: Options) -> Scenario:
@@ -126,6 +168,8 @@ def turing(options: Options) -> Scenario:
     """The paper's reaction-diffusion system (section 4), by default with parameters that make spots."""
     if options.source is not None:
         raise ValueError("--source belongs to heat; turing has no source.")
+    if options.boundary:
+        raise ValueError("--boundary belongs to heat; through the boundary of turing nothing flows.")
     note: tuple[str, ...] = ()
     if options.mesh == "sphere":
         mesh = shapes.icosphere(subdivisions=5)
@@ -149,7 +193,8 @@ def turing(options: Options) -> Scenario:
     rng = np.random.default_rng(options.seed)
     decay = reaction["decay"] + noise * rng.uniform(-1, 1, mesh.num_vertices)
 
-    def make_equation(dtype) -> Equation:
+    def make_equation(surface: Surface) -> Equation:
+        dtype = surface.dtype
         return ReactionDiffusion(
             diffusivity,
             kinetics.turk(
@@ -177,14 +222,24 @@ def turing(options: Options) -> Scenario:
 SCENARIOS: dict[str, Callable[[Options], Scenario]] = {"heat": heat, "turing": turing}
 
 
-def _diffusion(options, mesh, source, t1, formula, *, exact=None, exact_is="", notes=()) -> Scenario:
+def _diffusion(
+    options, mesh, source, t1, formula, *, exact=None, exact_is="", notes=(), conditions=(), takes_mean_off=False
+) -> Scenario:
+    def make_equation(surface: Surface) -> Equation:
+        g = jnp.asarray(source, surface.dtype)
+        if takes_mean_off:
+            # In the measure that diffusion conserves, or what is left of the mean would add up.
+            measure = surface.mass if isinstance(surface.scheme, Monotone) else surface.vertex_areas
+            g = g - integrate(surface, g, measure) / jnp.sum(measure)
+        return Diffusion(jnp.asarray(1.0, surface.dtype), g, conditions)
+
     return Scenario(
         name="heat",
         mesh=mesh,
-        make_equation=lambda dtype: Diffusion(jnp.asarray(1.0, dtype), jnp.asarray(source, dtype)),
+        make_equation=make_equation,
         u0=np.zeros(mesh.num_vertices),
         t1=t1 if options.t1 is None else options.t1,
-        parameters=dict(diffusivity=1.0, source=formula),
+        parameters=dict(diffusivity=1.0, source=formula, boundary=options.boundary or None),
         species=("u",),
         exact=exact,
         exact_is=exact_is,
@@ -193,6 +248,8 @@ def _diffusion(options, mesh, source, t1, formula, *, exact=None, exact_is="", n
 
 
 def _from_file(options: Options) -> tuple[Mesh, str]:
+    if options.mesh == "disk":
+        return shapes.disk(rings=40), "The disk has radius 1."
     mesh = load_mesh(options.mesh, repair=options.repair)
     if options.keep_scale:
         return mesh, f"The mesh keeps its scale: area {mesh.area:.6g}."
@@ -211,9 +268,3 @@ def _sine_profile(angle: np.ndarray) -> np.ndarray:
     root = math.sqrt((_MAJOR - _MINOR) / (_MAJOR + _MINOR))
     bracket = x - 2 * np.arctan2(root * np.sin(x / 2), np.cos(x / 2))
     return _MINOR**2 / 2 * np.sin(x) + _MAJOR * _MINOR / 2 * bracket
-
-
-def _vertex_areas(mesh: Mesh) -> np.ndarray:
-    corners = mesh.vertices[mesh.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    return np.bincount(mesh.faces.ravel(), np.repeat(areas / 3, 3), minlength=mesh.num_vertices)

@@ -22,9 +22,9 @@ MAY_IMPORT = {
     "equations": {"operators", "surface", "tables"},
     "solve": {"equations", "operators", "surface", "tables", "lifting"},
     "output": set(),
-    "scenario": {"mesh", "equations", "operators", "surface", "solve"},
+    "scenario": {"mesh", "lifting", "equations", "operators", "surface", "solve"},
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
-    "cli": {"scenario", "run", "mesh", "solve"},
+    "cli": {"scenario", "run", "mesh", "lifting", "solve"},
 }
 NO_JAX = ["mesh", "output", "lifting/support.py", "conservation.py", "progress.py"]
 

@@ -1,0 +1,202 @@
+"""Boundary conditions against exact solutions, on smooth boundaries and at corners."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import jn_zeros, jnp_zeros, jv
+
+import ltljax as ltl
+
+SHARP = dict(rtol=1e-8, atol=1e-10)
+
+
+def disk(rings):
+    mesh = ltl.shapes.jittered(ltl.shapes.disk(rings=rings), 0.2, seed=0)
+    x, y, _ = mesh.vertices.T
+    return ltl.Surface.from_mesh(mesh), np.hypot(x, y), np.arctan2(y, x)
+
+
+def relative(found, exact):
+    return float(np.linalg.norm(np.asarray(found) - exact) / np.linalg.norm(exact))
+
+
+def assert_second_order(errors, last):
+    assert np.log2(errors[0] / errors[-1]) / (len(errors) - 1) >= 1.8
+    assert errors[-1] < last
+
+
+def decay_errors(conditions, mode, rate, t1):
+    """Errors of u = mode exp(-rate t) on three disks."""
+    errors = []
+    for rings in (10, 20, 40):
+        surface, r, angle = disk(rings)
+        start = mode(r, angle)
+        u = ltl.solve(ltl.Diffusion(boundary=conditions), surface, start, t1, **SHARP).us[-1]
+        errors.append(relative(u, start * np.exp(-rate * t1)))
+    return errors
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_neumann_modes_of_a_disk(order):
+    zero = jnp_zeros(order, 1)[0]
+    errors = decay_errors((), lambda r, angle: jv(order, zero * r) * np.cos(order * angle), zero**2, 0.1)
+    assert_second_order(errors, 2e-3)
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_dirichlet_modes_of_a_disk(order):
+    zero = jn_zeros(order, 1)[0]
+    errors = decay_errors(ltl.Dirichlet(), lambda r, angle: jv(order, zero * r) * np.cos(order * angle), zero**2, 0.1)
+    assert_second_order(errors, 2e-3)
+
+
+def test_robin_modes_of_a_disk():
+    # u + 2 du/dr = 0 at r = 1.
+    k = brentq(lambda k: jv(0, k) - 2 * k * jv(1, k), 0.5, 2)
+    errors = decay_errors(ltl.Robin(a=1.0, b=2.0), lambda r, angle: jv(0, k * r), k**2, 0.5)
+    assert_second_order(errors, 1e-4)
+
+
+def test_a_flux_that_depends_on_time():
+    # u = exp(x / 2 - y / 3 + k t), k = 1/4 + 1/9, solves the heat equation.
+    errors = []
+    for rings in (10, 20, 40):
+        surface, r, angle = disk(rings)
+        x, y = r * np.cos(angle), r * np.sin(angle)
+
+        def flux(t, v):
+            u = jnp.exp(v[:, 0] / 2 - v[:, 1] / 3 + 13 / 36 * t)
+            return u * (v[:, 0] / 2 - v[:, 1] / 3)
+
+        start = np.exp(x / 2 - y / 3)
+        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(flux)), surface, start, 1.0, **SHARP).us[-1]
+        errors.append(relative(u, start * np.exp(13 / 36)))
+    assert_second_order(errors, 2e-4)
+
+
+def test_held_values_that_depend_on_time_are_held_exactly():
+    errors = []
+    for rings in (10, 20, 40):
+        surface, r, _ = disk(rings)
+        condition = ltl.Dirichlet(lambda t, v: jv(0, 2.0) * jnp.exp(-4 * t))
+        solution = ltl.solve(ltl.Diffusion(boundary=condition), surface, jv(0, 2 * r), 0.5, **SHARP)
+        np.testing.assert_allclose(solution.us[-1][surface.topology.boundary], jv(0, 2.0) * np.exp(-2), rtol=1e-12)
+        errors.append(relative(solution.us[-1], jv(0, 2 * r) * np.exp(-2)))
+    assert_second_order(errors, 1e-3)
+
+
+def test_a_gradient_serves_both_sides_of_the_corners_of_a_square():
+    errors, modes = [], []
+    for n in (12, 24, 48):
+        mesh = ltl.shapes.jittered(ltl.shapes.square(n=n), 0.2, seed=0)
+        surface = ltl.Surface.from_mesh(mesh)
+        assert (np.bincount(surface.topology.kinds) == [(n - 1) ** 2, 4 * (n - 1), 4]).all()
+        x, y, _ = mesh.vertices.T
+
+        def gradient(t, v):
+            u = jnp.exp(v[:, 0] / 2 - v[:, 1] / 3 + 13 / 36 * t)
+            return u[:, None] * jnp.asarray([[1 / 2, -1 / 3, 0]])
+
+        start = np.exp(x / 2 - y / 3)
+        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(gradient)), surface, start, 0.5, **SHARP).us[-1]
+        errors.append(relative(u, start * np.exp(13 / 72)))
+        start = np.cos(np.pi * x) * np.cos(2 * np.pi * y)
+        u = ltl.solve(ltl.Diffusion(), surface, start, 0.02, **SHARP).us[-1]
+        modes.append(relative(u, start * np.exp(-5 * np.pi**2 * 0.02)))
+    assert_second_order(errors, 5e-5)
+    assert_second_order(modes, 2e-3)
+
+
+def test_a_condition_holds_where_it_is_asked_for():
+    mesh = ltl.shapes.cylinder(radius=1.0, height=2.0, n_around=24, n_along=12)
+    surface = ltl.Surface.from_mesh(mesh)
+    z = mesh.vertices[:, 2]
+    loops = mesh.boundary_loops
+    low = int(z[loops[1]].mean() < 0)
+    ways = [
+        (ltl.Dirichlet(-1.0, where=low), ltl.Dirichlet(1.0, where=1 - low)),
+        (ltl.Dirichlet(-1.0, where=lambda v: v[:, 2] < 0), ltl.Dirichlet(1.0, where=lambda v: v[:, 2] > 0)),
+        (ltl.Dirichlet(-1.0, where=jnp.asarray(z == -1)), ltl.Dirichlet(1.0, where=jnp.asarray(z == 1))),
+        (ltl.Dirichlet(-1.0), ltl.Dirichlet(1.0, where=lambda v: v[:, 2] > 0)),
+        (ltl.Dirichlet(-1.0, where=low), ltl.Neumann(1.0, where=1 - low)),
+    ]
+    for conditions in ways:
+        u = ltl.solve(ltl.Diffusion(boundary=conditions), surface, 0 * z, 20.0).us[-1]
+        np.testing.assert_allclose(u, z, atol=1e-3)
+
+
+def test_a_mask_can_hold_values_inside():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
+    z = np.asarray(surface.vertices[:, 2])
+    held = jnp.asarray(np.abs(z) > 0.9)
+    condition = ltl.Dirichlet(lambda t, v: jnp.sign(v[:, 2]), where=held)
+    u = np.asarray(ltl.solve(ltl.Diffusion(boundary=condition), surface, 0 * z, 5.0).us[-1])
+    np.testing.assert_array_equal(u[held], np.sign(z)[held])
+    # The zonal harmonic function is a multiple of atanh z.
+    ring = np.abs(z) < 0.5
+    np.testing.assert_allclose(u[ring], np.arctanh(z[ring]) / np.arctanh(0.9), atol=0.06)
+
+
+def test_species_have_data_of_their_own():
+    surface, r, _ = disk(8)
+    equation = ltl.ReactionDiffusion(
+        (1.0, 2.0), lambda state, params: (0 * state[0], 0 * state[1]), boundary=ltl.Dirichlet(jnp.asarray([1.0, 3.0]))
+    )
+    u = ltl.solve(equation, surface, np.zeros((len(r), 2)), 4.0).us[-1]
+    np.testing.assert_allclose(u, np.broadcast_to([1.0, 3.0], u.shape), atol=1e-3)
+    equation = ltl.Diffusion(boundary=ltl.Robin(a=1.0, b=1.0, g=jnp.asarray([1.0, 3.0])))
+    u = ltl.solve(equation, surface, np.zeros((len(r), 2)), 10.0).us[-1]
+    np.testing.assert_allclose(u, np.broadcast_to([1.0, 3.0], u.shape), atol=1e-3)
+
+
+def test_data_can_be_differentiated():
+    surface, r, _ = disk(6)
+
+    def heat(flux, value):
+        conditions = (ltl.Neumann(flux), ltl.Dirichlet(value, where=lambda v: v[:, 0] > 0.5))
+        u = ltl.solve(ltl.Diffusion(boundary=conditions), surface, jnp.zeros(len(r)), 0.3, **SHARP).us[-1]
+        return jnp.sum(u**2)
+
+    at = (jnp.asarray(0.7), jnp.asarray(0.4))
+    step = 1e-4
+    for which, slope in enumerate(jax.grad(heat, argnums=(0, 1))(*at)):
+        ahead, behind = ([x + s * step * (i == which) for i, x in enumerate(at)] for s in (1, -1))
+        assert float(slope) == pytest.approx(float(heat(*ahead) - heat(*behind)) / (2 * step), rel=1e-5)
+
+
+def test_conditions_that_do_not_fit_are_refused():
+    surface, r, _ = disk(3)
+    u = jnp.zeros(len(r))
+    with pytest.raises(TypeError, match=r"Expected ltl\.Neumann"):
+        ltl.Diffusion(boundary="dirichlet")
+    with pytest.raises(ValueError, match=r"boundary data as a number or of shape \(37,\).*found \(5,\)"):
+        ltl.Diffusion(boundary=ltl.Dirichlet(jnp.zeros(5))).rate(0.0, surface, u)
+    with pytest.raises(ValueError, match="to give booleans"):
+        ltl.Diffusion(boundary=ltl.Neumann(where=jnp.zeros(5, bool))).rate(0.0, surface, u)
+    with pytest.raises(ValueError, match="Expected a flux of shape"):
+        ltl.laplacian(surface, u, flux=jnp.zeros((len(r), 2)))
+
+
+@pytest.mark.parametrize("angle", [60.0, 120.0, 150.0, 250.0])
+def test_rows_at_corners_of_any_angle_are_non_negative_and_exact_for_what_can_happen_there(angle):
+    # A sector: at its tip a smooth field without flux is c + r^2 to second order.
+    count = max(3, round(angle / 15))
+    turns = np.radians(np.linspace(0, angle, count + 1))
+    radii = np.linspace(0, 1, 7)[1:]
+    points = np.array([[0, 0]] + [[r * np.cos(a), r * np.sin(a)] for r in radii for a in turns])
+    faces = [[0, 1 + i, 2 + i] for i in range(count)]
+    for ring in range(len(radii) - 1):
+        a, b = 1 + ring * (count + 1), 1 + (ring + 1) * (count + 1)
+        for i in range(count):
+            faces += [[a + i, b + i, b + i + 1], [a + i, b + i + 1, a + i + 1]]
+    mesh = ltl.Mesh(np.column_stack([points, np.zeros(len(points))]), np.array(faces))
+    surface = ltl.Surface.from_mesh(mesh)
+    squared = np.sum(points**2, axis=1)
+    assert float(ltl.laplacian(surface, squared)[0]) == pytest.approx(4)
+    assert min(float(w.min()) for w in surface.geometry.laplacian_weights) >= 0
+    # A linear field has flux through both sides, and no Laplacian.
+    linear = points @ np.array([2.0, -3.0])
+    flux = np.broadcast_to([2.0, -3.0, 0.0], (len(points), 3))
+    assert float(ltl.laplacian(surface, linear, flux)[0]) == pytest.approx(0, abs=1e-9)
