@@ -17,8 +17,11 @@ def stationary_measure(generator: scipy.sparse.csr_array, areas: np.ndarray) -> 
     zero at a vertex that no other vertex's row uses. The walk ends in classes of vertices that it does not leave, as a
     rule one for each component; each class has one stationary measure, scaled by the area that ends there.
     """
-    generator = scipy.sparse.csr_array(generator)
-    generator.eliminate_zeros()
+    # Rows are made to sum to zero anew: in float32 they only nearly do.
+    rates = scipy.sparse.csr_array(generator, dtype=np.float64)
+    rates.setdiag(0)
+    rates.eliminate_zeros()
+    generator = scipy.sparse.csr_array(rates - scipy.sparse.diags_array(rates.sum(axis=1)))
     num_classes, label = csgraph.connected_components(generator, directed=True, connection="strong")
     rows, columns = generator.nonzero()
     is_closed = np.ones(num_classes, bool)

@@ -48,7 +48,7 @@ class EllipticStencil(eqx.Module):
         return difference_matrix(self.table, self.weights)
 
     def with_coefficients(
-        self, surface: Surface, diffusion: AnyArray, drift: AnyArray | None = None
+        self, surface: Surface, diffusion: AnyArray | float, drift: AnyArray | None = None
     ) -> "EllipticStencil":
         """The stencil of other coefficients, or of a moved surface, on the same neighbours: pure and differentiable.
 
@@ -147,7 +147,7 @@ def _checked(diffusion, frames: np.ndarray) -> np.ndarray:
     return tensor
 
 
-def _targets(frames: AnyArray, diffusion: AnyArray, drift: AnyArray | None) -> AnyArray:
+def _targets(frames: AnyArray, diffusion: AnyArray | float, drift: AnyArray | None) -> AnyArray:
     """What the operator makes of x, y, xy, x^2 and y^2 in the frame of each vertex, (1, 5, V)."""
     xp = frames.__array_namespace__()
     diffusion = xp.asarray(diffusion, dtype=frames.dtype)

@@ -59,21 +59,30 @@ def test_robin_modes_of_a_disk():
     assert_second_order(errors, 1e-4)
 
 
-def test_a_flux_that_depends_on_time():
-    # u = exp(x / 2 - y / 3 + k t), k = 1/4 + 1/9, solves the heat equation.
-    errors = []
+def test_flux_into_a_disk():
+    # exp(x) cos y is harmonic and goes on flowing through, while a Neumann mode decays on top of it.
+    zero, errors = jnp_zeros(0, 1)[0], []
     for rings in (10, 20, 40):
         surface, r, angle = disk(rings)
         x, y = r * np.cos(angle), r * np.sin(angle)
-
-        def flux(t, v):
-            u = jnp.exp(v[:, 0] / 2 - v[:, 1] / 3 + 13 / 36 * t)
-            return u * (v[:, 0] / 2 - v[:, 1] / 3)
-
-        start = np.exp(x / 2 - y / 3)
-        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(flux)), surface, start, 1.0, **SHARP).us[-1]
-        errors.append(relative(u, start * np.exp(13 / 36)))
+        steady, mode = np.exp(x) * np.cos(y), jv(0, zero * r)
+        flux = jnp.asarray(np.exp(x) * (x * np.cos(y) - y * np.sin(y)))
+        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(flux)), surface, steady + mode, 0.1, **SHARP).us[-1]
+        errors.append(relative(u, steady + mode * np.exp(-(zero**2) * 0.1)))
     assert_second_order(errors, 2e-4)
+
+
+def test_a_flux_that_depends_on_time():
+    # u = exp(x / 2 - y / 3 + k t), k = 1/4 + 1/9, solves the heat equation.
+    surface, r, angle = disk(20)
+    x, y = r * np.cos(angle), r * np.sin(angle)
+
+    def flux(t, v):
+        return jnp.exp(v[:, 0] / 2 - v[:, 1] / 3 + 13 / 36 * t) * (v[:, 0] / 2 - v[:, 1] / 3)
+
+    start = np.exp(x / 2 - y / 3)
+    u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(flux)), surface, start, 1.0, rtol=1e-7, atol=1e-9).us[-1]
+    assert relative(u, start * np.exp(13 / 36)) < 1e-4
 
 
 def test_held_values_that_depend_on_time_are_held_exactly():
@@ -95,17 +104,14 @@ def test_a_gradient_serves_both_sides_of_the_corners_of_a_square():
         assert (np.bincount(surface.topology.kinds) == [(n - 1) ** 2, 4 * (n - 1), 4]).all()
         x, y, _ = mesh.vertices.T
 
-        def gradient(t, v):
-            u = jnp.exp(v[:, 0] / 2 - v[:, 1] / 3 + 13 / 36 * t)
-            return u[:, None] * jnp.asarray([[1 / 2, -1 / 3, 0]])
-
-        start = np.exp(x / 2 - y / 3)
-        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(gradient)), surface, start, 0.5, **SHARP).us[-1]
-        errors.append(relative(u, start * np.exp(13 / 72)))
+        steady = np.exp(x / 2) * np.cos(y / 2)
+        gradient = np.stack([steady, -np.exp(x / 2) * np.sin(y / 2), 0 * x], axis=1) / 2
+        u = ltl.solve(ltl.Diffusion(boundary=ltl.Neumann(jnp.asarray(gradient))), surface, steady, 0.5, **SHARP).us[-1]
+        errors.append(relative(np.asarray(u) - np.mean(u), steady - steady.mean()))
         start = np.cos(np.pi * x) * np.cos(2 * np.pi * y)
         u = ltl.solve(ltl.Diffusion(), surface, start, 0.02, **SHARP).us[-1]
         modes.append(relative(u, start * np.exp(-5 * np.pi**2 * 0.02)))
-    assert_second_order(errors, 5e-5)
+    assert_second_order(errors, 1e-3)
     assert_second_order(modes, 2e-3)
 
 
@@ -168,13 +174,13 @@ def test_data_can_be_differentiated():
 
 def test_conditions_that_do_not_fit_are_refused():
     surface, r, _ = disk(3)
-    u = jnp.zeros(len(r))
-    with pytest.raises(TypeError, match=r"Expected ltl\.Neumann"):
+    u, t = jnp.zeros(len(r)), jnp.zeros(())
+    with pytest.raises(TypeError, match="Neumann"):
         ltl.Diffusion(boundary="dirichlet")
     with pytest.raises(ValueError, match=r"boundary data as a number or of shape \(37,\).*found \(5,\)"):
-        ltl.Diffusion(boundary=ltl.Dirichlet(jnp.zeros(5))).rate(0.0, surface, u)
+        ltl.Diffusion(boundary=ltl.Dirichlet(jnp.zeros(5))).rate(t, surface, u)
     with pytest.raises(ValueError, match="to give booleans"):
-        ltl.Diffusion(boundary=ltl.Neumann(where=jnp.zeros(5, bool))).rate(0.0, surface, u)
+        ltl.Diffusion(boundary=ltl.Neumann(where=jnp.zeros(5, bool))).rate(t, surface, u)
     with pytest.raises(ValueError, match="Expected a flux of shape"):
         ltl.laplacian(surface, u, flux=jnp.zeros((len(r), 2)))
 

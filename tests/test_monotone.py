@@ -9,6 +9,9 @@ from scipy.special import j0
 
 import ltljax as ltl
 
+# Of real meshes, which have a few.
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+
 SPHERES = {
     "icosphere": lambda: ltl.shapes.icosphere(4),
     "jittered": lambda: ltl.shapes.jittered_sphere(4, 0.5, seed=0),

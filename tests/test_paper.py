@@ -78,7 +78,9 @@ def with_turned_frames(surface, angles):
     e1, e2 = np.moveaxis(geometry.frames, 1, 0)
     cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
     frames = np.stack([cosine * e1 + sine * e2, cosine * e2 - sine * e1], axis=1)
-    geometry = weigh_in_frames(surface.scheme, geometry.vertices, topology, geometry.normals, frames)
+    geometry = weigh_in_frames(
+        surface.scheme, geometry.vertices, topology, geometry.normals, frames, geometry.conormals
+    )
     return dataclasses.replace(surface, geometry=jax.tree.map(jnp.asarray, geometry))
 
 

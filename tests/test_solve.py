@@ -10,6 +10,9 @@ import ltljax as ltl
 from ltljax.run import count_maxima
 from ltljax.solve.evolve import default_solver
 
+# Of real meshes, which have a few.
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+
 
 @pytest.fixture(scope="module")
 def sphere():

@@ -3,8 +3,8 @@
 With lifted coordinates (x, y) of the neighbours, weights c give an operator at the vertex when their moments
 ``sum c x, sum c y, sum c xy, sum c x^2, sum c y^2`` are what the operator makes of these monomials: (1, 0, 0, 0, 0) for
 d/dx, (0, 0, 0, 2, 2) for the Laplacian; and zero for every further monomial of the degree. Among all such weights
-those of least ``sum c^2 / w`` are taken, w falling with the distance: the rows of the least-squares fit of a polynomial
-through the vertex with weights w. The first and second derivatives of the fit are the jet of the field.
+those of least ``sum c^2 r^4`` are taken, r the distance: the rows of the least-squares fit of a polynomial through the
+vertex with weights r^-4. The first and second derivatives of the fit are the jet of the field.
 
 Source: the configuration equation of Wu, Chen and Chi, arXiv 1310.4807; here as a constrained least norm, of any
 degree.
@@ -137,7 +137,7 @@ def ring_moments(
     mean_square = xp.sum(squared, axis=0) / count
     scale = xp.sqrt(xp.where(mean_square > 0, mean_square, 1))
     x, y = lifted[..., 0] / scale[None], lifted[..., 1] / scale[None]
-    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0)
+    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0) ** 2
     moments = conditions(xp.stack([emphasis * x, emphasis * y, x * y, x**2, y**2]), kinds, 0)
     further = [x ** (n - k) * y**k for n in range(3, degree + 1) for k in range(n + 1)]
     return xp.concatenate([moments, xp.stack(further)]) if further else moments, weights, scale

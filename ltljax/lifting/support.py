@@ -63,12 +63,17 @@ def fit_support(rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch:
     """Rows that determine a polynomial fit.
 
     A quadratic is fitted on the one-ring where that determines it, else on two rings, else on three. Higher degrees
-    use the nearest of three rings, twice as many as a fit needs, and all of them where those do not determine it.
+    use the nearest of three rings, twice as many as a fit needs, and all of them where those do not determine it; near
+    the corners of a boundary four or five rings.
 
     Returns:
         The rows, and the vertices for which the first choice was not enough.
     """
-    choices = [(1, None), (2, None), (3, None)] if degree == 2 else [(3, 2 * num_monomials(degree)), (3, None)]
+    choices = (
+        [(1, None), (2, None), (3, None)]
+        if degree == 2
+        else [(3, 2 * num_monomials(degree)), (3, None), (4, None), (5, None)]
+    )
     rows, wanting = rings, np.arange(len(rings[0]) - 1)
     wide = wanting
     for attempt, (ring, nearest) in enumerate(choices):
@@ -156,12 +161,11 @@ def _nonnegative_rows(
             np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2, emphasis
         )
         target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
-        columns = weights**2
-        matrices = np.ascontiguousarray(np.moveaxis(moments * columns[None], -1, 0))
-        c = np.zeros(columns.shape)
+        matrices = np.ascontiguousarray(np.moveaxis(moments * weights[None], -1, 0))
+        c = np.zeros(weights.shape)
         for i, (matrix, right) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
             c[:, i] = nnls(matrix, right)[0]
-        reached = np.einsum("ikn,kn->in", moments, columns * c)
+        reached = np.einsum("ikn,kn->in", moments, weights * c)
         residual[todo] = relative_residual(target[None], reached[None], emphasis)[0]
         changed = np.any(is_picked[:, todo] != (c > 0), axis=0) & np.any(c > 0, axis=0)
         is_picked[:, todo] = c > 0
