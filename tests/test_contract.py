@@ -84,10 +84,17 @@ def test_derivatives_in_the_field(surface, name):
     check_grads(lambda u: OPERATORS[name](surface, u), (u,), order=2, modes=("fwd", "rev"), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("mesh", MESHES)
+def dented_sphere():
+    # Of few different rows, so that there is little to compile.
+    sphere = ltl.shapes.icosphere(1)
+    return ltl.Mesh(sphere.vertices + 0.05 * np.random.default_rng(0).normal(size=sphere.vertices.shape), sphere.faces)
+
+
+@pytest.mark.parametrize("make", [dented_sphere, bent_disk])
 @pytest.mark.parametrize("name", ["paper", "monotone", "polynomial"])
-def test_derivatives_of_gradient_and_laplacian_in_the_vertices(mesh, name):
-    surface = ltl.Surface.from_mesh(MESHES[mesh](), SCHEMES[name])
+@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+def test_derivatives_of_gradient_and_laplacian_in_the_vertices(make, name):
+    surface = ltl.Surface.from_mesh(make(), SCHEMES[name])
     u = field(surface, "laplacian")
 
     @jax.jit
@@ -102,7 +109,7 @@ def test_weighing_on_the_device_equals_building_on_the_host(surface):
     again = jax.jit(lambda s, v: s.with_vertices(v))(surface, surface.vertices)
     for built, weighed in zip(jax.tree.leaves(surface.geometry), jax.tree.leaves(again.geometry), strict=True):
         scale = max(float(jnp.abs(built).max(initial=0)), 1.0)
-        np.testing.assert_allclose(weighed, built, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(weighed, built, rtol=0, atol=1e-12 * scale)
 
 
 def test_empty_slots_weigh_nothing(surface):
