@@ -116,6 +116,38 @@ def test_without_the_picture_extra_a_run_goes_through_and_says_how_to_get_it(tmp
     assert not (tmp_path / "heat.png").exists()
 
 
+def run_heat(tmp_path, *arguments):
+    assert main(["run", "heat", *arguments, "--frames", "2", "--out", str(tmp_path)]) == 0
+    return json.loads((tmp_path / "summary.json").read_text())["measured"]
+
+
+def test_heat_in_a_disk_keeps_to_its_boundary_conditions(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    # Stationary for the source x: x (1 - r^2) / 8 where u = 0, x (3 - r^2) / 8 where nothing flows, and with
+    # u + du/dnu = 0 x (2 - r^2) / 8: the largest values are at r = 1 / sqrt(3), 1 and sqrt(2 / 3).
+    largest = {"dirichlet=0": 3**-1.5 / 4, "neumann=0@0": 1 / 4, "robin=1,1,0": (2 / 3) ** 1.5 / 4}
+    for condition, value in largest.items():
+        measured = run_heat(tmp_path, "--mesh", "disk", "--boundary", condition)
+        np.testing.assert_allclose(measured["range_of_u"], [-value, value], rtol=1e-2)
+
+
+def test_heat_without_flux_keeps_its_mass(tmp_path, real_mesh, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    measured = run_heat(tmp_path, "--mesh", str(real_mesh("hand_open.obj")))
+    assert abs(measured["mass_at_end"][0]) < 1e-10
+
+
+def test_the_polynomial_scheme_says_where_it_grows(tmp_path, mesh_file, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    assert run_heat(tmp_path, "--scheme", "polynomial", "--t1", "0.5")["relative_error_L2"] < 1e-3
+    path = mesh_file(ltl.shapes.random_sphere(642, seed=0))
+    arguments = ["run", "heat", "--mesh", path, "--scheme", "polynomial", "--degree", "3", "--out", str(tmp_path)]
+    assert main(arguments) == 1
+    printed = capsys.readouterr()
+    assert printed.out.count("note: Modes of this Laplacian grow like") == 1
+    assert "use ltl.Monotone()" in printed.err
+
+
 def test_the_published_scheme_on_an_irregular_mesh_stops_with_its_time_and_reason(tmp_path, mesh_file, capsys):
     path, out = mesh_file(ltl.shapes.jittered_sphere(3, 0.3, seed=0)), tmp_path / "out"
     code, said = fails(capsys, "run", "heat", "--mesh", path, "--scheme", "paper", "--out", str(out), "--frames", "5")
@@ -132,6 +164,13 @@ def test_the_published_scheme_on_an_irregular_mesh_stops_with_its_time_and_reaso
         (["run", "heat", "--mesh", "nowhere.obj"], "nowhere.obj"),
         (["run", "heat", "--t1", "-1"], "expected a positive number, found '-1'"),
         (["run", "heat", "--t1", "nan"], "expected a positive number"),
+        (["run", "heat", "--boundary", "neumann=1"], "needs a mesh with a boundary; the sphere is closed"),
+        (["run", "heat", "--mesh", "disk", "--boundary", "robin=1,2"], "robin=A,B,G"),
+        (["run", "heat", "--mesh", "disk", "--boundary", "robin=1,0,2"], "b not 0"),
+        (["run", "heat", "--mesh", "disk", "--boundary", "dirichlet=hot"], "found 'dirichlet=hot'"),
+        (["run", "heat", "--mesh", "disk", "--boundary", "dirichlet=0@1"], "expected a loop below 1"),
+        (["run", "turing", "--boundary", "neumann=1"], "--boundary belongs to heat"),
+        (["run", "heat", "--degree", "3"], "--degree 3 needs --scheme polynomial"),
         (["run", "heat", "--frames", "0"], "expected a whole number from 1"),
         (["run", "heat", "--seed", "x"], "expected a whole number from 0"),
         (["run", "heat", "--source", "sine"], "needs --mesh torus"),

@@ -3,8 +3,9 @@
 With lifted coordinates (x, y) of the neighbours, weights c give an operator at the vertex when their moments
 ``sum c x, sum c y, sum c xy, sum c x^2, sum c y^2`` are what the operator makes of these monomials: (1, 0, 0, 0, 0) for
 d/dx, (0, 0, 0, 2, 2) for the Laplacian; and zero for every further monomial of the degree. Among all such weights
-those of least ``sum c^2 r^4`` are taken, r the distance: the rows of the least-squares fit of a polynomial through the
-vertex with weights r^-4. The first and second derivatives of the fit are the jet of the field.
+those of least ``sum c^2 / w`` are taken: the rows of the least-squares fit of a polynomial through the vertex with
+weights w. With w = r^-4, r the distance, diffusion is most accurate; fits of degree 3 and 4 have twice the neighbours
+they need, and are best with w = r^-2. The first and second derivatives of the fit are the jet of the field.
 
 Source: the configuration equation of Wu, Chen and Chi, arXiv 1310.4807; here as a constrained least norm, of any
 degree.
@@ -137,9 +138,14 @@ def ring_moments(
     mean_square = xp.sum(squared, axis=0) / count
     scale = xp.sqrt(xp.where(mean_square > 0, mean_square, 1))
     x, y = lifted[..., 0] / scale[None], lifted[..., 1] / scale[None]
-    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0) ** 2
+    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0)
+    weights = weights**2 if degree == 2 else weights
     moments = conditions(xp.stack([emphasis * x, emphasis * y, x * y, x**2, y**2]), kinds, 0)
-    further = [x ** (n - k) * y**k for n in range(3, degree + 1) for k in range(n + 1)]
+    # By products: NumPy raises to a power one logarithm at a time.
+    further, highest = [], [x**2, x * y, y**2]
+    for _ in range(3, degree + 1):
+        highest = [x * monomial for monomial in highest] + [y * highest[-1]]
+        further += highest
     return xp.concatenate([moments, xp.stack(further)]) if further else moments, weights, scale
 
 
