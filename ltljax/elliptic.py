@@ -150,12 +150,12 @@ def _checked(diffusion, frames: np.ndarray) -> np.ndarray:
 def _targets(frames: AnyArray, diffusion: AnyArray | float, drift: AnyArray | None) -> AnyArray:
     """What the operator makes of x, y, xy, x^2 and y^2 in the frame of each vertex, (1, 5, V)."""
     xp = frames.__array_namespace__()
-    diffusion = xp.asarray(diffusion, dtype=frames.dtype)
-    if diffusion.ndim == 3:
-        tensor = xp.einsum("vac,vcd,vbd->abv", frames, diffusion, frames)
+    coefficient = xp.asarray(diffusion, dtype=frames.dtype)
+    if coefficient.ndim == 3:
+        tensor = xp.einsum("vac,vcd,vbd->abv", frames, coefficient, frames)
         xx, xy, yy = tensor[0, 0], tensor[0, 1], tensor[1, 1]
     else:
-        xx = yy = xp.broadcast_to(diffusion, frames.shape[:1])
+        xx = yy = xp.broadcast_to(coefficient, frames.shape[:1])
         xy = xp.zeros_like(xx)
     b = xp.zeros((2, frames.shape[0]), dtype=frames.dtype)
     if drift is not None:

@@ -48,7 +48,7 @@ _CORNER, _RIGHT = 40, 20
 
 
 class InconsistentRowsWarning(UserWarning):
-    """Some vertices have no consistent row of non-negative weights, so that diffusion is not accurate there."""
+    """Some vertices have no consistent row of weights, so that the Laplacian is not accurate there."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,6 +60,8 @@ class SurfaceReport:
             mean; else None.
         wide_gradient_rows: vertices whose one-ring (of `Polynomial`: whose nearest neighbours) does not determine the
             fit, so that the gradient uses more; None of `Paper`.
+        undetermined: vertices where no choice of neighbours determines the fit: the gradient there is not of its order,
+            and of `Polynomial` the Laplacian neither.
         rings: (V,) of `Monotone`: number of rings each Laplacian row was chosen from; else None.
         residual: (V,) of `Monotone`: relative moment residual of each Laplacian row; else None.
         inconsistent: vertices without a consistent non-negative row. Diffusion is stable there, but not accurate.
@@ -67,6 +69,7 @@ class SurfaceReport:
 
     dropped_faces: np.ndarray | None = None
     wide_gradient_rows: np.ndarray | None = None
+    undetermined: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
     rings: np.ndarray | None = None
     residual: np.ndarray | None = None
     inconsistent: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
@@ -84,6 +87,8 @@ class SurfaceReport:
             lines.append(("degenerate lifted faces", f"{self.dropped_faces.sum()}"))
         if self.wide_gradient_rows is not None:
             lines.append(("gradient rows wider than usual", f"{len(self.wide_gradient_rows)}"))
+        if len(self.undetermined):
+            lines.append(("gradient rows not determined", f"{len(self.undetermined)}"))
         if self.rings is not None and self.residual is not None:
             lines += [
                 (f"Laplacian rows chosen from {n} ring{'s' * (n > 1)}", f"{np.sum(self.rings == n)}") for n in (1, 2, 3)
@@ -127,7 +132,8 @@ class Surface(eqx.Module):
                 so small that its weights leave the range of the dtype.
 
         Warns:
-            InconsistentRowsWarning: `Monotone` found no consistent non-negative row at some vertices.
+            InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row, or `Polynomial`
+                no neighbours that determine its fit.
         """
         if not isinstance(mesh, Mesh):
             raise TypeError(
@@ -148,6 +154,8 @@ class Surface(eqx.Module):
             )
         if len(report.inconsistent):
             warnings.warn(_inconsistent(report), InconsistentRowsWarning, stacklevel=2)
+        elif isinstance(scheme, Polynomial) and len(report.undetermined):
+            warnings.warn(_undetermined(report, scheme), InconsistentRowsWarning, stacklevel=2)
         topology, geometry = jax.tree.map(jnp.asarray, (topology, geometry))
         return cls(topology, geometry, scheme, report)
 
@@ -266,6 +274,14 @@ def _float_dtype(dtype):
     return dtype
 
 
+def _undetermined(report: SurfaceReport, scheme: Polynomial) -> str:
+    return (
+        f"At {len(report.undetermined)} vertices, the first being vertex {report.undetermined[0]}, no five rings of "
+        f"neighbours determine a polynomial of degree {scheme.degree}. The mesh is too coarse or too thin there: "
+        "subdivide it, or use ltl.Monotone()."
+    )
+
+
 def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -> tuple[Topology, SurfaceReport]:
     """The topology of a mesh under a scheme, in NumPy: the rings, and the supports chosen from the positions."""
     rings = one_rings(mesh.faces, mesh.num_vertices)
@@ -309,7 +325,7 @@ def _choose_support(
     def wider(which: np.ndarray, rings_wide: int) -> support.Rows:
         return k_ring(rings, mesh.num_vertices, which, rings_wide)
 
-    jet_rows, wide = support.fit_support(
+    jet_rows, wide, undetermined = support.fit_support(
         rows,
         scheme.degree,
         wider,
@@ -318,7 +334,9 @@ def _choose_support(
     )
     topology = dataclasses.replace(topology, jet=build_table(*jet_rows))
     if isinstance(scheme, Polynomial):
-        return dataclasses.replace(topology, diffusion=topology.jet), SurfaceReport(wide_gradient_rows=wide)
+        return dataclasses.replace(topology, diffusion=topology.jet), SurfaceReport(
+            wide_gradient_rows=wide, undetermined=undetermined
+        )
     # The Laplacian's rows are laid out in the frames they will be weighed in.
     normals = fitted_normals(vertices, normals, topology.jet, scheme.degree)
     frames, _ = vertex_frames(vertices, normals, topology)
@@ -333,7 +351,11 @@ def _choose_support(
         watch("choosing the neighbours of the Laplacian"),
     )
     report = SurfaceReport(
-        wide_gradient_rows=wide, rings=record.rings, residual=record.residual, inconsistent=record.inconsistent
+        wide_gradient_rows=wide,
+        undetermined=undetermined,
+        rings=record.rings,
+        residual=record.residual,
+        inconsistent=record.inconsistent,
     )
     return dataclasses.replace(topology, diffusion=build_table(*diffusion)), report
 

@@ -164,6 +164,11 @@ def test_growing_modes_are_found_and_said_before_stepping():
     assert relative(u, x * np.exp(-1.0)) < 2e-3
 
 
+def test_a_mesh_too_coarse_for_the_fit_is_said():
+    with pytest.warns(ltl.InconsistentRowsWarning, match=r"At 12 vertices.*polynomial of degree 4.*subdivide"):
+        ltl.Surface.from_mesh(ltl.shapes.icosphere(0), ltl.Polynomial(4))
+
+
 def test_the_degree_is_checked():
     with pytest.raises(ValueError, match=r"degree 3 or 4, found 2.*Monotone"):
         ltl.Polynomial(2)

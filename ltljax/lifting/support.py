@@ -13,9 +13,12 @@ from scipy.optimize import nnls
 from .jets import conditions, moment_matrix, num_monomials, relative_residual, ring_moments, scaled_targets
 from .ring import Lift, lifted_ring
 
-# A ring determines a polynomial when the least eigenvalue of its moment matrix, scaled to unit diagonal, is this large.
+# A ring determines a polynomial well when the least eigenvalue of its moment matrix, scaled to unit diagonal, is this
+# large.
 # A regular hexagon has 0.29 for a quadratic; neighbours on a conic have none.
 _WELL_PLACED = {2: 0.02, 3: 0.003, 4: 0.001}
+# Below this it determines none.
+_PLACED = 1e-8
 # Relative moment residual below which a row counts as consistent.
 CONSISTENT = 1e-8
 # Rings beyond the third reach so far that a row would no longer be local.
@@ -59,7 +62,9 @@ def lift_onto(vertices: np.ndarray, frames: np.ndarray, lift: Lift) -> LiftAt:
     return lift_at
 
 
-def fit_support(rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch: Watch) -> tuple[Rows, np.ndarray]:
+def fit_support(
+    rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch: Watch
+) -> tuple[Rows, np.ndarray, np.ndarray]:
     """Rows that determine a polynomial fit.
 
     A quadratic is fitted on the one-ring where that determines it, else on two rings, else on three. Higher degrees
@@ -67,7 +72,7 @@ def fit_support(rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch:
     the corners of a boundary four or five rings.
 
     Returns:
-        The rows, and the vertices for which the first choice was not enough.
+        The rows, the vertices for which the first choice was not enough, and those for which no choice was.
     """
     choices = (
         [(1, None), (2, None), (3, None)]
@@ -85,21 +90,23 @@ def fit_support(rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch:
                 distance = np.where(is_used, np.sum(lifted**2, axis=-1), np.inf)
                 is_used &= distance <= np.partition(distance, nearest - 1, axis=0)[nearest - 1]
                 lifted = np.where(is_used[..., None], lifted, 0)
-            found.add(batch, candidates, is_used, determines_fit(lifted, degree))
+            is_last = attempt == len(choices) - 1
+            enough = _PLACED if is_last else _WELL_PLACED[degree]
+            found.add(batch, candidates, is_used, fit_quality(lifted, degree) > enough)
         rows = found.replace(rows)
         wanting = found.wanting()
         if attempt == 0:
             wide = wanting
-    return rows, wide
+    return rows, wide, wanting
 
 
-def determines_fit(lifted: np.ndarray, degree: int) -> np.ndarray:
-    """Whether each lifted ring (K, N, 2) determines a polynomial of the degree, (N,)."""
+def fit_quality(lifted: np.ndarray, degree: int) -> np.ndarray:
+    """How well each lifted ring (K, N, 2) determines a polynomial of the degree, (N,); zero where it does not."""
     moments, weights, _ = ring_moments(lifted, np.zeros(lifted.shape[1], np.int8), degree)
     matrix = np.moveaxis(moment_matrix(moments, weights), -1, 0)
     diagonal = np.einsum("nii->ni", matrix)
     unscaled = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    return np.linalg.eigvalsh(matrix * unscaled[:, :, None] * unscaled[:, None])[:, 0] > _WELL_PLACED[degree]
+    return np.linalg.eigvalsh(matrix * unscaled[:, :, None] * unscaled[:, None])[:, 0]
 
 
 def nonnegative_support(
