@@ -224,11 +224,12 @@ class Surface(eqx.Module):
         return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self.geometry))
 
     def remembered(self, name: str, compute: Callable[[], Any]) -> Any:
-        """What ``compute`` returns, computed once for these positions and kept on the host as long as they live."""
-        key = id(self.vertices)
+        """What ``compute`` returns, computed once for these weights and kept on the host as long as they live."""
+        weights = (self.geometry.laplacian_weights or self.geometry.gradient_weights[0])[0]
+        key = id(weights)
         if key not in _REMEMBERED:
             _REMEMBERED[key] = {}
-            weakref.finalize(self.vertices, _REMEMBERED.pop, key, None)
+            weakref.finalize(weights, _REMEMBERED.pop, key, None)
         kept = _REMEMBERED[key]
         if name not in kept:
             kept[name] = compute()
@@ -247,7 +248,7 @@ class Surface(eqx.Module):
 
 _weigh = eqx.filter_jit(weigh)
 
-# Results on the host, by the identity of the array of positions they belong to, for as long as that lives.
+# Results on the host, by the identity of the weights they belong to, for as long as those live.
 _REMEMBERED: dict[int, dict[str, Any]] = {}
 
 
@@ -298,6 +299,7 @@ def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -
         loops=np.repeat(np.arange(len(loops), dtype=np.int32), [len(loop) for loop in loops]),
         jet=ring,
         diffusion=None,
+        num_loops=len(loops),
     )
     if isinstance(scheme, Paper):
         frames = tangent_frames(normals)

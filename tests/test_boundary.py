@@ -181,6 +181,11 @@ def test_conditions_that_do_not_fit_are_refused():
         ltl.Diffusion(boundary=ltl.Dirichlet(jnp.zeros(5))).rate(t, surface, u)
     with pytest.raises(ValueError, match="to give booleans"):
         ltl.Diffusion(boundary=ltl.Neumann(where=jnp.zeros(5, bool))).rate(t, surface, u)
+    with pytest.raises(ValueError, match=r"boundary loop below 1 .* found 1"):
+        ltl.Diffusion(boundary=ltl.Neumann(where=1)).rate(t, surface, u)
+    closed = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    with pytest.raises(ValueError, match="the surface is closed"):
+        ltl.Diffusion(boundary=ltl.Dirichlet()).rate(t, closed, jnp.zeros(closed.num_vertices))
     with pytest.raises(ValueError, match="Expected a flux of shape"):
         ltl.laplacian(surface, u, flux=jnp.zeros((len(r), 2)))
 

@@ -151,6 +151,16 @@ def _where(condition: Condition, surface: Surface, inside: Array, outside: Array
 def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:
     """The vertices a condition is for."""
     topology = surface.topology
+    is_mask = not (where is None or isinstance(where, int) or callable(where))
+    if topology.num_loops == 0 and not is_mask:
+        raise ValueError(
+            "A boundary condition was given, but the surface is closed. Give a mask to hold values inside."
+        )
+    if isinstance(where, int) and not 0 <= where < topology.num_loops:
+        raise ValueError(
+            f"Expected the number of a boundary loop below {topology.num_loops} (see mesh.boundary_loops), "
+            f"found {where}."
+        )
     size = surface.num_vertices
     everywhere = jnp.zeros(size, bool).at[topology.boundary].set(True)
     if where is None:

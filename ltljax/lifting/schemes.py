@@ -83,6 +83,7 @@ class Topology(eqx.Module):
         kinds: (V,) `INTERIOR`, `SMOOTH` boundary, `RIGHT_CORNER` or `OTHER_CORNER`, see `lifting.jets`.
         boundary: (B,) the vertices on the boundary, loop by loop.
         loops: (B,) the number of the boundary loop each of them lies on.
+        num_loops: how many loops there are.
         jet: the neighbours of the gradient's fit.
         diffusion: the neighbours of the Laplacian; None where it is the divergence of the gradient.
     """
@@ -95,6 +96,7 @@ class Topology(eqx.Module):
     loops: Int[AnyArray, " B"]
     jet: Table
     diffusion: Table | None
+    num_loops: int = eqx.field(static=True, default=0)
 
 
 class Geometry(eqx.Module):
