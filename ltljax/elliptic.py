@@ -18,7 +18,16 @@ from .lifting.schemes import PerBlock, offsets
 from .mesh import k_ring, one_rings
 from .progress import watched
 from .surface import Surface
-from .tables import AnyArray, Table, build_table, difference_matrix, difference_sum
+from .tables import (
+    AnyArray,
+    ReverseWeights,
+    Table,
+    build_table,
+    difference_matrix,
+    difference_sum,
+    reverse_weights,
+    reversible,
+)
 
 # Where not every condition can be met the drift is to be exact, and the excess of diffusion the least.
 _EMPHASIS = 1e2
@@ -30,12 +39,14 @@ class EllipticStencil(eqx.Module):
     Attributes:
         table: the neighbours.
         weights: one array (K, N) per block of the table, non-negative.
+        reverse: the same weights in the order of the table's reverse, for derivatives in reverse mode.
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
         lift: how neighbours are laid into the tangent planes.
     """
 
     table: Table
     weights: PerBlock
+    reverse: ReverseWeights | None
     residual: Float[AnyArray, " V"]
     lift: Lift = eqx.field(static=True)
 
@@ -55,9 +66,11 @@ class EllipticStencil(eqx.Module):
         As good as the neighbours suit the new coefficients; ``residual`` tells.
         """
         targets = _targets(surface.geometry.frames, diffusion, drift)
-        weights, residual = _rows(surface.vertices, surface.geometry.frames, surface.topology.kinds, targets, self)
-        cast = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), (weights, residual))
-        return eqx.tree_at(lambda stencil: (stencil.weights, stencil.residual), self, cast)
+        frames, kinds = surface.geometry.frames, surface.topology.kinds
+        weights, residual = _rows(surface.vertices, frames, kinds, targets, self.table, self.lift)
+        found = (weights, reverse_weights(self.table, weights), residual)
+        cast = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
+        return EllipticStencil(self.table, *cast, self.lift)
 
 
 def elliptic_stencil(
@@ -99,8 +112,7 @@ def elliptic_stencil(
     lift: Lift = "projection" if surface.scheme.lift == "projection" else "chord"
     rings = one_rings(np.asarray(surface.faces), surface.num_vertices)
     rows = (rings.offsets, rings.neighbours)
-    ring = EllipticStencil(build_table(*rows), (), np.zeros(0), lift)
-    _, residual = _rows(vertices, frames, kinds, targets, ring)
+    _, residual = _rows(vertices, frames, kinds, targets, build_table(*rows), lift)
     # Where some row meets every condition there is nothing to emphasise.
     for emphasis in (1.0, _EMPHASIS):
         rows, record = support.nonnegative_support(
@@ -114,15 +126,17 @@ def elliptic_stencil(
             emphasis,
         )
         residual = record.residual
-    stencil = EllipticStencil(build_table(*rows), (), np.zeros(0), lift)
-    weights, residual = _rows(vertices, frames, kinds, targets, stencil)
-    weights, residual = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), (weights, residual))
-    return EllipticStencil(jax.tree.map(jnp.asarray, stencil.table), weights, residual, lift)
+    table = reversible(build_table(*rows))
+    weights, residual = _rows(vertices, frames, kinds, targets, table, lift)
+    found = (weights, reverse_weights(table, weights), residual)
+    return EllipticStencil(
+        jax.tree.map(jnp.asarray, table), *jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found), lift
+    )
 
 
 @eqx.filter_jit
 def _apply(stencil: EllipticStencil, u: AnyArray) -> Array:
-    return difference_sum(stencil.table, stencil.weights, u)
+    return difference_sum(stencil.table, stencil.weights, u, stencil.reverse)
 
 
 def _checked(diffusion, frames: np.ndarray) -> np.ndarray:
@@ -163,12 +177,11 @@ def _targets(frames: AnyArray, diffusion: AnyArray | float, drift: AnyArray | No
     return xp.stack([b[0], b[1], 2 * xy, 2 * xx, 2 * yy])[None]
 
 
-def _rows(vertices, frames, kinds, targets, stencil: EllipticStencil) -> tuple[PerBlock, AnyArray]:
-    """The weights on the stencil's neighbours, and the residual of every row."""
-    table = stencil.table
+def _rows(vertices, frames, kinds, targets, table: Table, lift: Lift) -> tuple[PerBlock, AnyArray]:
+    """The weights on the neighbours, and the residual of every row."""
 
     def rows(block):
-        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), stencil.lift)
+        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), lift)
         wanted = block.centre(targets[0].T).T[None]
         c, residual = operator_weights(lifted, block.centre(kinds), wanted, nonnegative=True, emphasis=_EMPHASIS)
         return c[0], residual[0]

@@ -17,7 +17,7 @@ import scipy.sparse.linalg
 from jaxtyping import Array, Float
 
 from .surface import Surface
-from .tables import AnyArray, difference_matrix, difference_sum, slot_sum
+from .tables import AnyArray, difference_matrix, difference_sum, differences, slot_sum
 
 # Below this size all eigenvalues are computed at once.
 _DENSE = 300
@@ -100,7 +100,7 @@ def laplacian(
     if table is None or weights is None:
         rate = _divergence_in_frame(surface, *_gradient_in_frame(surface, u))
     else:
-        rate = difference_sum(table, weights, u)
+        rate = difference_sum(table, weights, u, surface.geometry.laplacian_reverse)
     return rate if flux is None else add_flux(surface, rate, through_sides(surface, jnp.asarray(flux, u.dtype), u))
 
 
@@ -147,7 +147,8 @@ def weighted_laplacian(
         x, y = _gradient_in_frame(surface, u)
         g = conductivity.reshape(-1, *(1,) * (u.ndim - 1))
         return _divergence_in_frame(surface, g * x, g * y)
-    means = table.each(lambda block: (block.neighbours(conductivity) + block.centre(conductivity)[None]) / 2)
+    rises = differences(table, conductivity)
+    means = table.each(lambda block, rise: block.centre(conductivity)[None] + rise / 2, rises)
     return difference_sum(table, tuple(w * g for w, g in zip(weights, means, strict=True)), u)
 
 

@@ -1,9 +1,11 @@
 """Reactions: how species change one another at a point, ``((u, v), params) -> (du, dv)``."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -23,7 +25,13 @@ class Kinetics(eqx.Module):
 
     def __call__(self, u: Float[Array, "V S"]) -> Float[Array, "V S"]:
         """The rates of change of all species at every vertex."""
-        return jnp.stack(self.rates(tuple(u[:, s] for s in range(u.shape[1])), self.params), axis=1)
+        return _together(self.rates, u, self.params)
+
+
+# In reverse mode only u is kept for every evaluation, and not each product the rates are made of.
+@functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=0)
+def _together(rates: Rates, u: Array, params: Any) -> Array:
+    return jnp.stack(rates(tuple(u[:, s] for s in range(u.shape[1])), params), axis=1)
 
 
 def turk(

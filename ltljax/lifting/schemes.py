@@ -9,7 +9,7 @@ from typing import ClassVar, cast
 import equinox as eqx
 from jaxtyping import Float, Int
 
-from ..tables import AnyArray, Block, Table, slot_sum
+from ..tables import AnyArray, Block, ReverseWeights, Table, reverse_weights, slot_sum
 from . import jets, paper
 from .frames import boundary_frames, corner_conormals, tangent_frames, transport
 from .ring import Lift, RingTopology, centroid_normals, inverted_normals, last_slot, lifted_ring, take_slots
@@ -112,6 +112,8 @@ class Geometry(eqx.Module):
         divergence_weights: two sets of weights on the jet table, on the two components at the neighbours.
         divergence_centre: (V, 2) the weights on the vertex's own components that the difference form leaves over.
         laplacian_weights: weights on the diffusion table, or None.
+        laplacian_reverse: the same weights in the order of the table's reverse, which reverse-mode derivatives read in
+            every step; None where the table has no reverse.
         laplacian_residual: (V,) how far each Laplacian row is from consistent, relative, zero to rounding where it is;
             after moving the vertices it tells whether the frozen support still serves. None without such rows.
         conormals: (B, 2, 3) the outward conormals of both sides of each boundary vertex, equal where it is smooth.
@@ -127,6 +129,7 @@ class Geometry(eqx.Module):
     divergence_weights: tuple[PerBlock, PerBlock]
     divergence_centre: Float[AnyArray, "V 2"]
     laplacian_weights: PerBlock | None
+    laplacian_reverse: ReverseWeights | None
     laplacian_residual: Float[AnyArray, " V"] | None
     conormals: Float[AnyArray, "B 2 3"]
     flux_weights: Float[AnyArray, "B 2"] | None
@@ -222,11 +225,12 @@ def weigh_in_frames(
     along_x, along_y = zip(*(weights for _, weights in per_block), strict=True)
     divergence = (along_x, along_y)
     centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, gradient, strict=True)]
-    laplacian, residual, flux = None, None, None
+    laplacian, backwards, residual, flux = None, None, None, None
     if topology.diffusion is not None:
         laplacian, residual, first = diffusion_rows(
             cast(Monotone | Polynomial, scheme), vertices, normals, frames, topology.kinds, topology.diffusion
         )
+        backwards = reverse_weights(topology.diffusion, laplacian)
         flux = _flux_weights(first[topology.boundary], frames[topology.boundary], conormals)
     return Geometry(
         vertices=vertices,
@@ -238,6 +242,7 @@ def weigh_in_frames(
         divergence_weights=divergence,
         divergence_centre=xp.stack(centre, axis=-1),
         laplacian_weights=laplacian,
+        laplacian_reverse=backwards,
         laplacian_residual=residual,
         conormals=conormals,
         flux_weights=flux,

@@ -1,12 +1,12 @@
-"""Padded neighbour tables, and the one loop everything runs through: a weighted sum over the slots of a row.
-
-What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and sums over its slots. Knows no
-geometry.
+"""Padded neighbour tables: rows of neighbours of any length become a few arrays of fixed width.
 
 Tables are slot-major: ``indices[k, v]`` is the neighbour of vertex v in slot k. An empty slot holds v's own index and
 weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few rows longer than
 most do not widen the table: the bulk has the width that costs the least memory, and longer rows live in tail blocks
 whose widths double, so at most half of any tail block is padding.
+
+A table can carry its reverse: for every vertex, the rows that use it. With it a transposed sum gathers, where the plain
+transpose of a gather would scatter, which is several times slower.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float, Int
@@ -27,10 +26,15 @@ if TYPE_CHECKING:
 else:
     AnyArray = Array | np.ndarray
 
-# Beyond this many slots a loop unrolled over slots only costs compile time.
-_UNROLL = 32
 # Rows at once on the host.
 _PIECE = 1 << 13
+
+
+def take(values: AnyArray, indices: AnyArray) -> AnyArray:
+    """The values at indices the host has checked, so that XLA needs no checks for bounds or for negative indices."""
+    if isinstance(values, np.ndarray):
+        return values[indices]
+    return values.at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 class Block(eqx.Module):
@@ -41,17 +45,23 @@ class Block(eqx.Module):
 
     def centre(self, values: AnyArray) -> AnyArray:
         """The values at this block's own rows: (V, ...) -> (N, ...)."""
-        return values if self.rows is None else _take(values, self.rows)
+        return values if self.rows is None else take(values, self.rows)
 
     def neighbours(self, values: AnyArray) -> AnyArray:
         """The values at the neighbours: (V, ...) -> (K, N, ...)."""
-        return _take(values, self.indices)
+        return take(values, self.indices)
 
 
 class Table(eqx.Module):
-    """Neighbours of every vertex: the bulk block, then tail blocks that replace the rows too long for it."""
+    """Neighbours of every vertex: the bulk block, then tail blocks that replace the rows too long for it.
+
+    Attributes:
+        blocks: the bulk, then the tail.
+        reverse: who uses each vertex; without it transposed sums scatter.
+    """
 
     blocks: tuple[Block, ...]
+    reverse: "Reverse | None" = None
 
     @property
     def num_vertices(self) -> int:
@@ -71,7 +81,9 @@ class Table(eqx.Module):
                 out = out.copy()
                 out[block.rows] = value
             else:
-                out = out.at[block.rows].set(value, unique_indices=True)
+                out = out.at[block.rows].set(
+                    value, mode="promise_in_bounds", unique_indices=True, wrap_negative_indices=False
+                )
         return out
 
     def map(self, function: Callable[..., AnyArray], *per_block) -> AnyArray:
@@ -90,6 +102,31 @@ class Table(eqx.Module):
         return results
 
 
+class Reverse(eqx.Module):
+    """A table read backwards.
+
+    Attributes:
+        users: for every vertex, the rows in which it is a neighbour.
+        positions: for each block of ``users``, which slot of the table that is: a position in the table's slots laid
+            end to end, block after block; their number, where a slot of ``users`` is empty.
+    """
+
+    users: Table
+    positions: tuple[AnyArray, ...]
+
+
+class ReverseWeights(eqx.Module):
+    """Weights of a table in the order of its reverse.
+
+    Attributes:
+        slots: one array (K, N) for each block of ``reverse.users``.
+        imbalance: (V,) the sum of what others' rows weigh each vertex with, less the sum of its own row.
+    """
+
+    slots: tuple[AnyArray, ...]
+    imbalance: Float[AnyArray, " V"]
+
+
 def _pieces(block: Block, arguments: list[Any]):
     """A block and what belongs to it, arrays (..., N) in any nest; on the host a few thousand rows at a time.
 
@@ -106,13 +143,6 @@ def _pieces(block: Block, arguments: list[Any]):
         yield here, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
 
 
-def _take(values: AnyArray, indices: AnyArray) -> AnyArray:
-    if isinstance(values, np.ndarray):
-        return values[indices]
-    # The host has checked every index, so the bounds check XLA would add is not needed.
-    return values.at[indices].get(mode="promise_in_bounds")
-
-
 def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
     """The table of rows given as ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
 
@@ -123,17 +153,42 @@ def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
         offsets: (V + 1,) integers.
         neighbours: (sum of lengths,) vertex indices.
     """
-    num_vertices = len(offsets) - 1
     lengths = np.diff(offsets)
-    width = _bulk_width(lengths)
-    blocks = [_block(offsets, neighbours, lengths, np.arange(num_vertices), width, is_bulk=True)]
-    while width < lengths.max(initial=0):
-        longer = np.flatnonzero((lengths > width) & (lengths <= 2 * width))
-        width *= 2
-        if len(longer):
-            widest = int(lengths[longer].max())
-            blocks.append(_block(offsets, neighbours, lengths, longer, widest, is_bulk=False))
-    return Table(tuple(blocks))
+    return Table(tuple(_laid_out(rows, offsets, neighbours, lengths) for rows in _division(lengths)))
+
+
+def reversible(table: Table) -> Table:
+    """The table with its reverse (host)."""
+    owners, users, positions, start = [], [], [], 0
+    for block in table.blocks:
+        row = np.broadcast_to(block.centre(np.arange(table.num_vertices, dtype=np.int32)), block.indices.shape)
+        is_used = block.indices != row
+        owners.append(block.indices[is_used])
+        users.append(row[is_used])
+        positions.append(start + np.flatnonzero(is_used))
+        start += block.indices.size
+    owners, users, positions = map(np.concatenate, (owners, users, positions))
+    order = np.argsort(owners, kind="stable")
+    lengths = np.bincount(owners, minlength=table.num_vertices)
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    division = list(_division(lengths))
+    blocks = tuple(_laid_out(rows, offsets, users[order], lengths) for rows in division)
+    where = tuple(_laid_out(rows, offsets, positions[order], lengths, empty=start).indices for rows in division)
+    return Table(table.blocks, Reverse(Table(blocks), where))
+
+
+def reverse_weights(table: Table, weights: tuple[AnyArray, ...]) -> ReverseWeights | None:
+    """The weights in the order of the table's reverse; None of a table without one.
+
+    In a loop that is differentiated in reverse they are wanted in every step: compute them once, before it.
+    """
+    if table.reverse is None:
+        return None
+    xp = weights[0].__array_namespace__()
+    none = xp.zeros(1, dtype=weights[0].dtype)
+    flat = xp.concatenate([*(block.reshape(-1) for block in weights), none])
+    slots = tuple(take(flat, positions) for positions in table.reverse.positions)
+    return ReverseWeights(slots, slot_sum(table.reverse.users, slots) - slot_sum(table, weights))
 
 
 def _bulk_width(lengths: np.ndarray) -> int:
@@ -144,36 +199,26 @@ def _bulk_width(lengths: np.ndarray) -> int:
     return max(1, int(np.argmin(len(lengths) * widths + 2 * longer)))
 
 
-def _block(offsets, neighbours, lengths, rows, width, *, is_bulk) -> Block:
+def _division(lengths: np.ndarray):
+    """The rows of every block and its width; the bulk has all rows, which is written None."""
+    width = _bulk_width(lengths)
+    yield None, width
+    while width < lengths.max(initial=0):
+        longer = np.flatnonzero((lengths > width) & (lengths <= 2 * width))
+        width *= 2
+        if len(longer):
+            yield longer, int(lengths[longer].max())
+
+
+def _laid_out(part, offsets, values, lengths, empty=None) -> Block:
+    """A block of the values of rows; an empty slot holds the row's own index, or ``empty``."""
+    rows, width = part
+    own = np.arange(len(lengths)) if rows is None else rows
     slot = np.arange(width)[:, None]
-    used = slot < np.where(lengths[rows] <= width, lengths[rows], 0)
-    position = np.minimum(offsets[rows] + slot, max(len(neighbours) - 1, 0))
-    indices = np.where(used, neighbours[position] if len(neighbours) else 0, rows)
-    return Block(indices.astype(np.int32), None if is_bulk else rows.astype(np.int32))
-
-
-def difference_sum(table: Table, weights: tuple[Array, ...], u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
-    """``sum_k w[k, v] * (u[neighbour k of v] - u[v])`` for every vertex v: the hot loop.
-
-    Args:
-        table: the neighbours.
-        weights: one array (K, N) per block of the table.
-        u: (V,) or (V, S).
-    """
-    return table.map(lambda block, w: _difference_sum(block, w, u), weights)
-
-
-def _difference_sum(block: Block, weights: Array, u: Array) -> Array:
-    centre = block.centre(u)
-    trailing = (1,) * (u.ndim - 1)
-    if weights.shape[0] > _UNROLL:
-        return jnp.sum(weights.reshape(*weights.shape, *trailing) * (block.neighbours(u) - centre[None]), axis=0)
-    # Unrolled, the slots fuse into one pass over u with no (K, N) intermediate.
-    total = jnp.zeros_like(centre)
-    for slot in range(weights.shape[0]):
-        weight = weights[slot].reshape(-1, *trailing)
-        total = total + weight * (_take(u, block.indices[slot]) - centre)
-    return total
+    used = slot < np.where(lengths[own] <= width, lengths[own], 0)
+    position = np.minimum(offsets[own] + slot, max(len(values) - 1, 0))
+    held = np.where(used, values[position] if len(values) else 0, own if empty is None else empty)
+    return Block(held.astype(np.int32), None if rows is None else rows.astype(np.int32))
 
 
 def slot_sum(table: Table, weights: tuple[AnyArray, ...]) -> AnyArray:

@@ -1,0 +1,36 @@
+"""Padded neighbour tables, and the one loop everything runs through: a weighted sum over the slots of a row.
+
+What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and sums over its slots with all
+their derivatives. Knows no geometry.
+"""
+
+from .contraction import difference_sum, differences
+from .table import (
+    AnyArray,
+    Block,
+    Reverse,
+    ReverseWeights,
+    Table,
+    build_table,
+    coordinates,
+    difference_matrix,
+    reverse_weights,
+    reversible,
+    slot_sum,
+)
+
+__all__ = [
+    "AnyArray",
+    "Block",
+    "Reverse",
+    "ReverseWeights",
+    "Table",
+    "build_table",
+    "coordinates",
+    "difference_matrix",
+    "difference_sum",
+    "differences",
+    "reverse_weights",
+    "reversible",
+    "slot_sum",
+]
