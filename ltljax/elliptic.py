@@ -69,8 +69,8 @@ class EllipticStencil(eqx.Module):
         frames, kinds = surface.geometry.frames, surface.topology.kinds
         weights, residual = _rows(surface.vertices, frames, kinds, targets, self.table, self.lift)
         found = (weights, reverse_weights(self.table, weights), residual)
-        cast = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, *cast, self.lift)
+        weights, reverse, residual = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
+        return EllipticStencil(self.table, weights, reverse, residual, self.lift)
 
 
 def elliptic_stencil(
@@ -129,9 +129,8 @@ def elliptic_stencil(
     table = reversible(build_table(*rows))
     weights, residual = _rows(vertices, frames, kinds, targets, table, lift)
     found = (weights, reverse_weights(table, weights), residual)
-    return EllipticStencil(
-        jax.tree.map(jnp.asarray, table), *jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found), lift
-    )
+    weights, reverse, residual = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
+    return EllipticStencil(jax.tree.map(jnp.asarray, table), weights, reverse, residual, lift)
 
 
 @eqx.filter_jit

@@ -11,7 +11,8 @@ forms gathers (the transpose over the table's reverse) no derivative ever scatte
 Why the loop has this shape (CPU, two cores; `benchmarks/speed.py` measures it, docs/hot_loop.md has the figures):
 
 - Slot-major and unrolled over slots, a sum is one kernel: one pass over indices and weights, no (K, N) intermediate.
-- Differences, not a matrix with a diagonal: rounding is then relative to u[k] - u[v], which float32 needs on fine meshes.
+- Differences, not a matrix with a diagonal: rounding is then relative to u[k] - u[v], which float32 needs on fine
+  meshes.
 - What goes in and what comes out is settled in memory. Left to itself XLA fuses whatever computes u into every one of
   the K gathers and computes it K times; two sums in a row take five times as long as they should, a Runge-Kutta step
   with its derivative fifty times.
@@ -49,7 +50,7 @@ class _Operands(NamedTuple):
 
 
 def difference_sum(
-    table: Table, weights: tuple[Array, ...], u: Float[AnyArray, "V *S"], reverse: ReverseWeights | None = None
+    table: Table, weights: tuple[AnyArray, ...], u: Float[AnyArray, "V *S"], reverse: ReverseWeights | None = None
 ) -> Float[Array, "V *S"]:
     """``sum_k w[k, v] * (u[neighbour k of v] - u[v])`` for every vertex v: the hot loop.
 
@@ -85,7 +86,7 @@ def _evaluate(*leaves, structure, open_: Argument, levels: _Levels, settle: Call
     """The contraction in plain JAX: what the primitive computes, abstractly and compiled."""
     function = functools.partial(_form, open_=open_, settle=settle)
     for level in reversed(levels):
-        axes: Any = _Operands(*(0 if name in level else None for name in _Operands._fields))
+        axes: Any = _Operands._make(0 if name in level else None for name in _Operands._fields)
         function = jax.vmap(function, in_axes=(axes,))
     return function(structure.unflatten(leaves))
 
@@ -169,7 +170,7 @@ def _by_name(structure, values) -> dict[str, list[Any]]:
     return {name: list(itertools.islice(values, child.num_leaves)) for name, child in children}
 
 
-def _filled(operands: _Operands, name: Argument, values: list[Array], open_: Argument) -> _Operands:
+def _filled(operands: _Operands, name: Argument, values: list[Any], open_: Argument) -> _Operands:
     """The operands with one argument filled in and one left open; other weights have another reverse."""
     value = tuple(values) if name == "weights" else values[0]
     operands = operands._replace(**{open_: None, name: value})

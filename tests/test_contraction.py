@@ -1,0 +1,217 @@
+"""The loop over slots: every derivative of it, under every transformation, is the one of the dense trilinear form."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+import ltljax as ltl
+from ltljax.tables import build_table, difference_sum, differences, reverse_weights, reversible
+
+rows_of_neighbours = st.integers(2, 9).flatmap(
+    lambda n: st.lists(st.lists(st.integers(0, n - 1), max_size=40), min_size=n, max_size=n)
+)
+
+
+def table_of(rows):
+    rows = [[j for j in row if j != v] for v, row in enumerate(rows)]
+    offsets = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
+    return build_table(offsets, np.array([j for row in rows for j in row], np.int32))
+
+
+def weights_of(table, random):
+    own = [np.arange(table.num_vertices) if block.rows is None else block.rows for block in table.blocks]
+    pairs = zip(table.blocks, own, strict=True)
+    return tuple(jnp.asarray(random.normal(size=b.indices.shape) * (b.indices != o)) for b, o in pairs)
+
+
+def dense_of(table, weights):
+    """The matrix of the sum, written in JAX so that it can be differentiated: the independent account."""
+    matrix = jnp.zeros((table.num_vertices,) * 2)
+    for block, weight in zip(table.blocks, weights, strict=True):
+        own = np.arange(table.num_vertices) if block.rows is None else block.rows
+        matrix = matrix.at[np.broadcast_to(own, block.indices.shape), block.indices].add(weight)
+    return matrix - jnp.diag(matrix.sum(axis=1))
+
+
+KINDS = ["reverse at hand", "reverse computed", "no reverse"]
+
+
+def loop_of(table, kind):
+    """The sum as a function of weights and field."""
+    table = table if kind == "no reverse" else reversible(table)
+    if kind == "reverse at hand":
+        return lambda w, u: difference_sum(table, w, u, jax.lax.stop_gradient(reverse_weights(table, w)))
+    return lambda w, u: difference_sum(table, w, u)
+
+
+def close(found, expected):
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(deadline=None, max_examples=8)
+@given(rows=rows_of_neighbours, seed=st.integers(0, 2**31), species=st.sampled_from([(), (1,), (3,), (2, 2)]))
+def test_sum_and_transposes_equal_the_dense_form_on_any_table(kind, rows, seed, species):
+    table, random = table_of(rows), np.random.default_rng(seed)
+    weights = weights_of(table, random)
+    u, y = (jnp.asarray(random.normal(size=(len(rows), *species))) for _ in range(2))
+    found, back = jax.vjp(loop_of(table, kind), weights, u)
+    expected, dense_back = jax.vjp(lambda w, u: jnp.tensordot(dense_of(table, w), u, axes=1), weights, u)
+    close(found, expected)
+    (in_weights, in_field), (dense_in_weights, dense_in_field) = back(y), dense_back(y)
+    close(in_field, dense_in_field)
+    for block, here, there in zip(table.blocks, in_weights, dense_in_weights, strict=True):
+        own = np.arange(table.num_vertices) if block.rows is None else block.rows
+        # The loop's derivative in an empty slot is that of a difference of zero.
+        np.testing.assert_allclose(here, jnp.where(block.indices == own, 0, there), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A table with tails forward and backward, weights and a field."""
+    random = np.random.default_rng(0)
+    rows = [list(random.choice(14, size=random.integers(1, 5), replace=False)) for _ in range(14)]
+    rows[3], rows[7] = list(range(14)), [3, *list(range(8, 14))]
+    table = table_of([list(map(int, row)) + ([5] if v != 5 else []) for v, row in enumerate(rows)])
+    assert len(table.blocks) > 1
+    assert len(reversible(table).reverse.users.blocks) > 1
+    return table, weights_of(table, random), jnp.asarray(random.normal(size=(14, 2)))
+
+
+def run(loop, w, u):
+    """A nonlinear run of three steps; linear in nothing, so that no derivative is trivial."""
+    u, _ = jax.lax.scan(lambda u, _: (u + 0.1 * jnp.tanh(loop(w, u) * u), None), u, length=3)
+    return jnp.sum(u**3)
+
+
+def checkpointed(loop, w, u):
+    u, _ = jax.lax.scan(jax.checkpoint(lambda u, _: (u + 0.1 * jnp.tanh(loop(w, u) * u), None)), u, length=3)
+    return jnp.sum(u**3)
+
+
+def stacked(tree, count):
+    return jax.tree.map(lambda leaf: jnp.stack([leaf * (k + 1) for k in range(count)]), tree)
+
+
+TRANSFORMED = {
+    "jit": lambda f, w, u: jax.jit(f)(w, u),
+    "vmap over fields": lambda f, w, u: jax.vmap(f, in_axes=(None, 0))(w, stacked(u, 3)),
+    "vmap over the last axis": lambda f, w, u: jax.vmap(f, in_axes=(None, -1), out_axes=-1)(w, u),
+    "vmap over weights": lambda f, w, u: jax.vmap(f, in_axes=(0, None))(stacked(w, 3), u),
+    "vmap over both": lambda f, w, u: jax.vmap(f)(stacked(w, 3), stacked(u, 3)),
+    "vmap over one, then the other": lambda f, w, u: jax.vmap(jax.vmap(f, (None, 0)), (0, None))(
+        stacked(w, 2), stacked(u, 3)
+    ),
+    "gradient": lambda f, w, u: jax.grad(run, argnums=(1, 2))(f, w, u),
+    "gradient through checkpoints": lambda f, w, u: jax.jit(
+        jax.grad(lambda w, u: checkpointed(f, w, u), argnums=(0, 1))
+    )(w, u),
+    "gradient of a vmap over weights": lambda f, w, u: jax.grad(
+        lambda u: jnp.sum(jnp.sin(jax.vmap(f, in_axes=(0, None))(stacked(w, 3), u)))
+    )(u),
+    "gradient in weights of a vmap over fields": lambda f, w, u: jax.grad(
+        lambda w: jnp.sum(jnp.sin(jax.vmap(f, in_axes=(None, 0))(w, stacked(u, 3))))
+    )(w),
+    "vmap of gradients": lambda f, w, u: jax.vmap(lambda w: jax.grad(lambda w, u: run(f, w, u), argnums=(0, 1))(w, u))(
+        stacked(w, 2)
+    ),
+    "jacfwd": lambda f, w, u: jax.jacfwd(f, argnums=(0, 1))(w, u),
+    "jacrev": lambda f, w, u: jax.jacrev(f, argnums=(0, 1))(w, u),
+    "hessian": lambda f, w, u: jax.jit(jax.hessian(lambda w, u: run(f, w, u), argnums=(0, 1)))(w, u),
+    "reverse over reverse": lambda f, w, u: jax.grad(lambda w: jnp.sum(jax.grad(lambda u: run(f, w, u))(u) ** 2))(w),
+    "linear transpose": lambda f, w, u: jax.linear_transpose(lambda u: f(w, u), u)(u),
+    "linear transpose in weights": lambda f, w, u: jax.linear_transpose(lambda w: f(w, u), w)(u),
+    "linearize": lambda f, w, u: jax.linearize(f, w, u)[1](w, u),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", TRANSFORMED)
+def test_transformations_equal_those_of_the_dense_form(case, name, kind):
+    table, weights, u = case
+    if name == "linear transpose in weights" and kind == "reverse at hand":
+        # Written as two terms of the weights, of which the derivative of one is stopped: not linear to JAX.
+        kind = "reverse computed"
+    used = [b.indices != (np.arange(14) if b.rows is None else b.rows) for b in table.blocks]
+
+    def masked(f):  # derivatives in empty slots aside, which the dense form does not know of
+        return lambda w, u: f(tuple(jnp.where(m, x, 0) for m, x in zip(used, w, strict=True)), u)
+
+    transform = TRANSFORMED[name]
+    found = transform(masked(loop_of(table, kind)), weights, u)
+    close(found, transform(masked(lambda w, u: dense_of(table, w) @ u), weights, u))
+
+
+def test_first_and_second_derivatives_agree_with_differences(case):
+    table, weights, u = case
+    loop = loop_of(table, "reverse at hand")
+    check_grads(lambda w, u: jnp.sin(loop(w, u)), (weights, u), order=2, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
+
+
+def test_tables_of_the_same_shape_can_be_batched():
+    random = np.random.default_rng(1)
+    tables = [reversible(table_of([[(v + k) % 8 for k in (1, 2 + shift, 5)] for v in range(8)])) for shift in (0, 1)]
+    weights = [weights_of(table, random) for table in tables]
+    u = jnp.asarray(random.normal(size=8))
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+    ws = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
+    energy = lambda table, w, u: jnp.sum(difference_sum(table, w, u) ** 2)  # noqa: E731
+    found = jax.vmap(jax.grad(energy, argnums=2), in_axes=(0, 0, None))(together, ws, u)
+    for k, (table, w) in enumerate(zip(tables, weights, strict=True)):
+        matrix = dense_of(table, w)
+        np.testing.assert_allclose(found[k], 2 * matrix.T @ (matrix @ u), atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_differences_are_differences_and_so_is_their_derivative(case, kind):
+    table, _, u = case
+    used = table if kind == "no reverse" else reversible(table)
+    expected = [block.neighbours(u[:, 0]) - block.centre(u[:, 0])[None] for block in table.blocks]
+    close(list(differences(used, u[:, 0])), expected)
+    plain = lambda u: sum(jnp.sum(jnp.sin(b.neighbours(u) - b.centre(u)[None])) for b in table.blocks)  # noqa: E731
+    ours = lambda u: sum(jnp.sum(jnp.sin(d)) for d in differences(used, u))  # noqa: E731
+    close(jax.grad(ours)(u[:, 0]), jax.grad(plain)(u[:, 0]))
+
+
+def compiled_gradient(surface):
+    """The HLO of the gradient of a reaction-diffusion run, with respect to the rates and the initial state."""
+
+    def loss(feed, u):
+        equation = ltl.ReactionDiffusion((0.1, 0.05), ltl.kinetics.gray_scott(feed))
+        rate = lambda u: equation.rate(jnp.zeros(()), surface, u)  # noqa: E731
+        u, _ = jax.lax.scan(lambda u, _: (u + 1e-3 * rate(u), None), u, length=5)
+        return jnp.sum(u**2)
+
+    lowered = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(jnp.asarray(0.04), jnp.ones((surface.num_vertices, 2)))
+    return lowered.compile().as_text()
+
+
+@pytest.mark.parametrize("scheme", [ltl.Monotone(), ltl.Paper()], ids=str)
+def test_the_reverse_pass_of_a_run_gathers_and_never_scatters(scheme):
+    mesh = ltl.shapes.icosphere(3)
+    surface = ltl.Surface.from_mesh(mesh, scheme)
+    assert (
+        len(surface.topology.jet.blocks) == 1
+    )  # with a tail its few rows are scattered into place, in both directions
+    assert " scatter(" not in compiled_gradient(surface)
+    # And the search would find one.
+    assert " scatter(" in compiled_gradient(ltl.Surface.from_mesh(mesh, scheme, differentiable=False))
+
+
+def test_sums_in_a_row_are_computed_one_after_the_other():
+    # Fused, the first would be computed anew for every neighbour of the second.
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
+    slots = surface.topology.diffusion.blocks[0].indices.shape[0]
+    twice = jax.jit(lambda surface, u: ltl.laplacian(surface, ltl.laplacian(surface, u)))
+    text = twice.lower(surface, surface.vertices[:, 0]).compile().as_text()
+    gathers = [len(re.findall(r" gather\(", part)) for part in re.split(r"\n\}\n", text)]
+    assert max(gathers) == slots
+    assert sum(gathers) == 2 * slots
