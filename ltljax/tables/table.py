@@ -188,7 +188,10 @@ def reverse_weights(table: Table, weights: tuple[AnyArray, ...]) -> ReverseWeigh
     none = xp.zeros(1, dtype=weights[0].dtype)
     flat = xp.concatenate([*(block.reshape(-1) for block in weights), none])
     slots = tuple(take(flat, positions) for positions in table.reverse.positions)
-    return ReverseWeights(slots, slot_sum(table.reverse.users, slots) - slot_sum(table, weights))
+    own = xp.arange(table.num_vertices, dtype=np.int32)
+    # Weights of the surface are zero in empty slots, but derivatives with respect to them need not be.
+    used = table.map(lambda block, w: xp.where(block.indices == block.centre(own)[None], 0, w).sum(axis=0), weights)
+    return ReverseWeights(slots, slot_sum(table.reverse.users, slots) - used)
 
 
 def _bulk_width(lengths: np.ndarray) -> int:
