@@ -185,9 +185,11 @@ def count_maxima(mesh: Mesh, values: np.ndarray) -> int:
 def _write(example: Scenario, out: Path, reached: _Progress) -> list[str]:
     from .output import colors, files, pictures
 
-    vertices, faces = example.mesh.vertices, example.mesh.faces
+    # What was computed in an order that keeps neighbours together is written in that of the source.
+    order = example.mesh.source_order
+    vertices, faces = example.mesh.vertices[order], np.argsort(order)[example.mesh.faces].astype(np.int32)
     name, times = example.name, np.array(reached.times)
-    fields = [dict(zip(example.species, u.reshape(len(u), -1).T, strict=True)) for u in reached.states]
+    fields = [dict(zip(example.species, u[order].reshape(len(u), -1).T, strict=True)) for u in reached.states]
     shown = example.species[example.shown]
     series = out / "series"
     series.mkdir(exist_ok=True)

@@ -191,7 +191,8 @@ def turing(options: Options) -> Scenario:
         diffusivity, start, noise, t1 = (0.8, 0.1), 4.0, 0.1, 40.0
         note += ("Where v falls below 0.05 its sink fades to zero, which keeps v from turning negative.",)
     rng = np.random.default_rng(options.seed)
-    decay = reaction["decay"] + noise * rng.uniform(-1, 1, mesh.num_vertices)
+    decay = np.full(mesh.num_vertices, reaction["decay"])
+    decay[mesh.source_order] += noise * rng.uniform(-1, 1, mesh.num_vertices)
 
     def make_equation(surface: Surface) -> Equation:
         dtype = surface.dtype
@@ -250,7 +251,7 @@ def _diffusion(
 def _from_file(options: Options) -> tuple[Mesh, str]:
     if options.mesh == "disk":
         return shapes.disk(rings=40), "The disk has radius 1."
-    mesh = load_mesh(options.mesh, repair=options.repair)
+    mesh = load_mesh(options.mesh, repair=options.repair).reordered()
     if options.keep_scale:
         return mesh, f"The mesh keeps its scale: area {mesh.area:.6g}."
     factor = math.sqrt(4 * math.pi / mesh.area)

@@ -72,6 +72,21 @@ def test_the_series_is_read_back_by_vtk_to_the_last_bit(tmp_path):
     assert entry.attrib == {"timestep": "0.5", "file": "a.vtp"}
 
 
+def test_results_come_in_the_order_of_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("ltljax.output.pictures.can_draw", lambda: False)
+    sphere = ltl.shapes.icosphere(2)
+    order = np.random.default_rng(0).permutation(sphere.num_vertices)
+    shuffled = tmp_path / "shuffled.obj"
+    faces = np.argsort(order)[sphere.faces] + 1
+    lines = [*("v {} {} {}".format(*v) for v in sphere.vertices[order]), *("f {} {} {}".format(*f) for f in faces)]
+    shuffled.write_text("\n".join(lines))
+    arguments = ["run", "heat", "--mesh", str(shuffled), "--keep-scale", "--frames", "2", "--t1", "0.5"]
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
+    written = ltl.load_mesh(tmp_path / "out" / "heat.ply")
+    np.testing.assert_allclose(written.vertices, sphere.vertices[order], atol=1e-6)
+    np.testing.assert_array_equal(written.faces, faces - 1)
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -187,3 +187,44 @@ def test_a_large_mesh_takes_little_time():
     k_ring(rings, mesh.num_vertices, np.arange(0, 100_000, 10), 3)
     assert mesh.report.edges == 300_000
     assert time.perf_counter() - began < 10  # half a second in practice
+
+
+def shuffled(mesh: Mesh, seed: int) -> Mesh:
+    order = np.random.default_rng(seed).permutation(mesh.num_vertices)
+    normals = None if mesh.normals is None else mesh.normals[order]
+    return Mesh(mesh.vertices[order], np.argsort(order)[mesh.faces], normals=normals)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_reordering_renumbers_and_changes_nothing_else(name):
+    mesh = shuffled(SHAPES[name], seed=4)
+    for new in (mesh.reordered(), mesh.reordered().reordered(), mesh.reordered().scaled(2).scaled(0.5)):
+        back = new.source_order
+        np.testing.assert_array_equal(new.vertices[back], mesh.vertices)
+        np.testing.assert_array_equal(np.argsort(back)[new.faces], mesh.faces)
+        if mesh.normals is not None:
+            np.testing.assert_array_equal(new.normals[back], mesh.normals)
+        # Loops keep their numbers and their beginnings.
+        for loop, expected in zip(new.boundary_loops, mesh.boundary_loops, strict=True):
+            np.testing.assert_array_equal(np.argsort(back)[loop], expected)
+        data = np.arange(mesh.num_vertices)
+        np.testing.assert_array_equal(new.pull(data)[back], data)
+        np.testing.assert_array_equal(new.push(new.pull(data)), data)
+
+
+def test_reordering_leads_back_to_a_source_with_welded_and_dropped_vertices():
+    sphere = shapes.icosphere(1)
+    doubled = np.concatenate([sphere.vertices, [[9, 9, 9]], sphere.vertices])
+    mesh = Mesh(doubled, np.where(sphere.faces % 2, sphere.faces, sphere.faces + len(sphere.vertices) + 1), weld=True)
+    new = mesh.reordered()
+    np.testing.assert_array_equal(new.vertices, doubled[new.original_index])
+    pushed = new.push(new.vertices[:, 0])
+    np.testing.assert_array_equal(np.isnan(pushed), doubled[:, 0] == 9)
+    np.testing.assert_array_equal(pushed[~np.isnan(pushed)], doubled[~np.isnan(pushed), 0])
+
+
+def test_reordering_brings_neighbours_together():
+    mesh = shuffled(shapes.icosphere(5), seed=0)
+    before, after = (np.abs(np.diff(m.edges, axis=1)).mean() for m in (mesh, mesh.reordered()))
+    assert before > mesh.num_vertices / 4
+    assert after < 2 * np.sqrt(mesh.num_vertices)

@@ -29,6 +29,8 @@ class Mesh:
         original_index: (V,) int64, for each vertex the (first) vertex it came from in the file or array handed in.
         welded_index: (V_original,) int64, for each vertex handed in the one it became, or -1 if it was dropped.
         normals: (V, 3) float64, exact unit outward normals where the shape is known by formula, else None.
+        source_order: (V,) int32, the vertices in the order they were handed in: ``data[mesh.source_order]`` undoes
+            `reordered`; without it 0, 1, 2, ...
     """
 
     vertices: np.ndarray
@@ -36,6 +38,7 @@ class Mesh:
     original_index: np.ndarray
     welded_index: np.ndarray
     normals: np.ndarray | None
+    source_order: np.ndarray
     _checked: Checked
 
     def __init__(
@@ -67,9 +70,9 @@ class Mesh:
             if is_bad.any():
                 first = int(checked.original_index[np.flatnonzero(is_bad)[0]])
                 raise MeshError(f"Normals must have length 1, but the one at vertex {first} has not. Normalise them.")
-        self._fill(checked, unit_normals)
+        self._fill(checked, unit_normals, np.arange(len(checked.vertices), dtype=np.int32))
 
-    def _fill(self, checked: Checked, normals: np.ndarray | None) -> None:
+    def _fill(self, checked: Checked, normals: np.ndarray | None, source_order: np.ndarray) -> None:
         """Sets the fields, once, and makes their arrays read-only."""
         fields = {
             "vertices": checked.vertices,
@@ -77,6 +80,7 @@ class Mesh:
             "original_index": checked.original_index,
             "welded_index": checked.welded_index,
             "normals": normals,
+            "source_order": source_order,
             "_checked": checked,
         }
         for name, value in fields.items():
@@ -101,8 +105,14 @@ class Mesh:
 
     @cached_property
     def boundary_loops(self) -> list[np.ndarray]:
-        """The boundary curves, each an int32 array of vertices with the surface on the left."""
-        return [_frozen(loop) for loop in topology.boundary_loops(self.faces, self.num_vertices)]
+        """The boundary curves, each an int32 array of vertices with the surface on the left.
+
+        A loop begins at its first vertex in the order of the source, and the loops are sorted by that vertex.
+        """
+        rank = np.argsort(self.source_order)
+        loops = topology.boundary_loops(self.faces, self.num_vertices)
+        loops = [np.roll(loop, -int(np.argmin(rank[loop]))) for loop in loops]
+        return [_frozen(loop) for loop in sorted(loops, key=lambda loop: rank[loop[0]])]
 
     @cached_property
     def boundary_vertices(self) -> np.ndarray:
@@ -217,7 +227,28 @@ class Mesh:
                 f"weights need {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}. Use a factor closer to 1."
             )
         mesh = object.__new__(Mesh)
-        mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals)
+        mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals, self.source_order)
+        return mesh
+
+    def reordered(self) -> "Mesh":
+        """The mesh with its vertices renumbered so that neighbours are near one another in memory.
+
+        Operators on a scan whose vertices come in no order run up to three times faster on it. Faces keep their order,
+        boundary loops their numbers; `pull` and `push` go on to lead from and to the data of the source, and
+        ``data[mesh.source_order]`` puts data of the new order back into that of the source.
+        """
+        order = topology.locality_order(self.faces, self.num_vertices)
+        place = np.empty(self.num_vertices, np.int32)
+        place[order] = np.arange(self.num_vertices, dtype=np.int32)
+        checked = dataclasses.replace(
+            self._checked,
+            vertices=self.vertices[order],
+            faces=place[self.faces],
+            original_index=self.original_index[order],
+            welded_index=np.where(self.welded_index < 0, -1, place[self.welded_index]).astype(np.int64),
+        )
+        mesh = object.__new__(Mesh)
+        mesh._fill(checked, None if self.normals is None else self.normals[order], place[self.source_order])
         return mesh
 
     def __repr__(self) -> str:

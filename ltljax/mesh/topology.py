@@ -108,6 +108,13 @@ def boundary_loops(faces: np.ndarray, num_vertices: int) -> list[np.ndarray]:
     return loops
 
 
+def locality_order(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """The vertices (V,), int32, in an order that puts neighbours near one another (reverse Cuthill and McKee)."""
+    ends = half_edges(faces)
+    adjacency = sparse.csr_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(num_vertices,) * 2)
+    return csgraph.reverse_cuthill_mckee((adjacency + adjacency.T).tocsr(), symmetric_mode=True)
+
+
 def vertex_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
     """The label (V,), int32, of the connected component of every vertex, numbered by their first vertices."""
     edges = half_edges(faces)
