@@ -1,4 +1,4 @@
-"""How far a long piece of work is, said on the terminal."""
+"""How far a long piece of work is, said on the terminal, and how long its parts took."""
 
 import sys
 import time
@@ -34,3 +34,21 @@ def _plain(steps: Sequence[Any], what: str) -> Iterator[Any]:
             left = (time.perf_counter() - start) / done * (len(steps) - done)
             print(f"{what}: {100 * done // len(steps)} %, about {left:.0f} s left", file=sys.stderr)
         yield step
+
+
+class Laps:
+    """A stopwatch for work in parts.
+
+    Attributes:
+        seconds: how long each part took, in order.
+    """
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    def end(self, part: str) -> None:
+        """The end of a part that began with the last one's end."""
+        now = time.perf_counter()
+        self.seconds[part] = now - self._start
+        self._start = now

@@ -39,7 +39,7 @@ from .lifting.schemes import (
     weigh,
 )
 from .mesh import Mesh, OneRings, k_ring, one_rings
-from .progress import watched
+from .progress import Laps, watched
 from .tables import AnyArray, Table, build_table, difference_matrix, reversible
 
 # A boundary that turns by more than this many degrees at a vertex has a corner there, and within so many degrees of a
@@ -65,6 +65,7 @@ class SurfaceReport:
         rings: (V,) of `Monotone`: number of rings each Laplacian row was chosen from; else None.
         residual: (V,) of `Monotone`: relative moment residual of each Laplacian row; else None.
         inconsistent: vertices without a consistent non-negative row. Diffusion is stable there, but not accurate.
+        seconds: how long each part of the construction took.
     """
 
     dropped_faces: np.ndarray | None = None
@@ -73,6 +74,7 @@ class SurfaceReport:
     rings: np.ndarray | None = None
     residual: np.ndarray | None = None
     inconsistent: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     # A report decides no computation, so surfaces that differ only in it share compiled code.
     def __eq__(self, other):
@@ -96,6 +98,7 @@ class SurfaceReport:
             lines.append(("inconsistent Laplacian rows", f"{len(self.inconsistent)}"))
             if len(self.inconsistent):
                 lines.append(("worst moment residual", f"{self.residual.max():.2g}"))
+        lines += [(f"seconds for {part}", f"{seconds:.2f}") for part, seconds in self.seconds.items()]
         return "\n".join(f"{name:<36}{value}" for name, value in lines)
 
 
@@ -147,9 +150,11 @@ class Surface(eqx.Module):
         if not isinstance(scheme, Scheme):
             raise TypeError(f"Expected a scheme such as ltl.Monotone() or ltl.Paper(), found {scheme!r}.")
         dtype = _float_dtype(dtype)
-        topology, report = _freeze(mesh, scheme, functools.partial(watched, progress=progress))
+        laps = Laps()
+        topology, report = _freeze(mesh, scheme, functools.partial(watched, progress=progress), laps)
         if differentiable:
             topology = _with_reverse(topology)
+            laps.end("reversed tables")
         # On the host in NumPy, where float64 is always at hand and nothing has to be compiled for the mesh's size.
         with np.errstate(over="ignore"):  # an overflow of the cast is found below
             geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), weigh(scheme, mesh.vertices, topology))
@@ -163,6 +168,8 @@ class Surface(eqx.Module):
         elif isinstance(scheme, Polynomial) and len(report.undetermined):
             warnings.warn(_undetermined(report, scheme), InconsistentRowsWarning, stacklevel=2)
         topology, geometry = jax.tree.map(jnp.asarray, (topology, geometry))
+        laps.end("weights")
+        report = dataclasses.replace(report, seconds=laps.seconds)
         return cls(topology, geometry, scheme, report)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
@@ -289,7 +296,9 @@ def _undetermined(report: SurfaceReport, scheme: Polynomial) -> str:
     )
 
 
-def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -> tuple[Topology, SurfaceReport]:
+def _freeze(
+    mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch], laps: Laps
+) -> tuple[Topology, SurfaceReport]:
     """The topology of a mesh under a scheme, in NumPy: the rings, and the supports chosen from the positions."""
     rings = one_rings(mesh.faces, mesh.num_vertices)
     ring = build_table(rings.offsets, rings.neighbours)
@@ -307,6 +316,7 @@ def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -
         diffusion=None,
         num_loops=len(loops),
     )
+    laps.end("rings")
     if isinstance(scheme, Paper):
         frames = tangent_frames(normals)
         return topology, SurfaceReport(
@@ -317,7 +327,7 @@ def _freeze(mesh: Mesh, scheme: Scheme, watch: Callable[[str], support.Watch]) -
                 topology.ring_blocks,
             )
         )
-    return _choose_support(mesh, rings, normals, topology, scheme, watch)
+    return _choose_support(mesh, rings, normals, topology, scheme, watch, laps)
 
 
 def _choose_support(
@@ -327,6 +337,7 @@ def _choose_support(
     topology: Topology,
     scheme: Monotone | Polynomial,
     watch: Callable[[str], support.Watch],
+    laps: Laps,
 ) -> tuple[Topology, SurfaceReport]:
     vertices, rows = mesh.vertices, (rings.offsets, rings.neighbours)
 
@@ -341,6 +352,7 @@ def _choose_support(
         watch("choosing the neighbours of the gradient"),
     )
     topology = dataclasses.replace(topology, jet=build_table(*jet_rows))
+    laps.end("gradient rows")
     if isinstance(scheme, Polynomial):
         return dataclasses.replace(topology, diffusion=topology.jet), SurfaceReport(
             wide_gradient_rows=wide, undetermined=undetermined
@@ -365,7 +377,9 @@ def _choose_support(
         residual=record.residual,
         inconsistent=record.inconsistent,
     )
-    return dataclasses.replace(topology, diffusion=build_table(*diffusion)), report
+    topology = dataclasses.replace(topology, diffusion=build_table(*diffusion))
+    laps.end("Laplacian rows")
+    return topology, report
 
 
 def _with_reverse(topology: Topology) -> Topology:

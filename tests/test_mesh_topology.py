@@ -219,8 +219,8 @@ def test_reordering_leads_back_to_a_source_with_welded_and_dropped_vertices():
     new = mesh.reordered()
     np.testing.assert_array_equal(new.vertices, doubled[new.original_index])
     pushed = new.push(new.vertices[:, 0])
-    np.testing.assert_array_equal(np.isnan(pushed), doubled[:, 0] == 9)
-    np.testing.assert_array_equal(pushed[~np.isnan(pushed)], doubled[~np.isnan(pushed), 0])
+    np.testing.assert_array_equal(pushed, mesh.push(mesh.vertices[:, 0]))
+    assert 0 < np.isnan(pushed).sum() < len(pushed)
 
 
 def test_reordering_brings_neighbours_together():
