@@ -112,10 +112,7 @@ def _settled(table: Table, values: Any) -> Any:
 
 
 def _settled_on_cpu(table: Table, values: Any) -> Any:
-    """The same, by a loop that is never entered: on CPU some releases of XLA drop barriers before they fuse.
-
-    That no index is negative only the host knows, so the compiler cannot leave the loop out.
-    """
+    """The same, by a loop that is never entered; that no index is negative the compiler cannot know."""
     start = (table.blocks[0].indices[0, 0], values)
     return jax.lax.while_loop(
         lambda state: state[0] < 0, lambda state: (state[0] + 1, jax.tree.map(jnp.negative, state[1])), start
@@ -152,7 +149,9 @@ def _over_species(weights: Array, u: Array) -> Array:
 contraction_p = Primitive("table_contraction")
 contraction_p.multiple_results = True
 contraction_p.def_impl(jax.jit(contraction_p.bind, static_argnames=("structure", "open_", "levels")))
-for platform, settle in ((None, _settled), ("cpu", _settled_on_cpu)):
+# On CPU these releases drop barriers before they fuse; the loop that holds there costs a copy of u.
+_DROPS_BARRIERS = jax.__version_info__ < (0, 11)
+for platform, settle in ((None, _settled), ("cpu", _settled_on_cpu))[: 1 + _DROPS_BARRIERS]:
     lowering = mlir.lower_fun(functools.partial(_evaluate, settle=settle), multiple_results=True)
     mlir.register_lowering(contraction_p, lowering, platform=platform)
 
