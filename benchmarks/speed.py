@@ -90,11 +90,18 @@ def compiled(function, *arguments):
     return (lambda: jax.block_until_ready(executable(*arguments))), seconds, executable
 
 
+def level_of(size):
+    return round(math.log(size / 10, 4))
+
+
+def is_icosphere(size):
+    return abs(10 * 4 ** level_of(size) - size) < 0.1 * size
+
+
 @functools.cache
 def mesh_of(size):
-    level = round(math.log(size / 10, 4))
-    if abs(10 * 4**level - size) < 0.1 * size:
-        return ltl.shapes.icosphere(level)
+    if is_icosphere(size):
+        return ltl.shapes.icosphere(level_of(size))
     n_minor = round(math.sqrt(size / 2))
     return ltl.shapes.torus(n_major=2 * n_minor, n_minor=n_minor)
 
@@ -382,11 +389,13 @@ def build_table(arguments):
     header("mesh", "vertices", "ltljax", "peak", "kept", "Paper", "robust-laplacian", "libigl")
     for kind in ("icosphere", "jittered torus"):
         for size in arguments.sizes:
+            if kind == "icosphere" and not is_icosphere(size):
+                continue
             call = [sys.executable, __file__, "--child", kind, str(size)]
             ours, paper = (run_child([*call, scheme]) for scheme in ("Monotone", "Paper"))
             peers = [run_child([*call, peer]) if has(peer) else None for peer in ("robust_laplacian", "igl")]
             row(
-                kind, ours["vertices"], f"{ours['seconds']:.1f}", f"{ours['peak']:.0f}", f"{ours['kept']:.0f}",
+                kind, f"{ours['vertices']:.0f}", f"{ours['seconds']:.1f}", f"{ours['peak']:.0f}", f"{ours['kept']:.0f}",
                 f"{paper['seconds']:.1f}", *("-" if peer is None else f"{peer['seconds']:.1f}" for peer in peers),
             )  # fmt: skip
 
@@ -400,9 +409,8 @@ def child(kind, size, what):
     """One build, alone in its process, so that its peak of memory is its own."""
     warnings.simplefilter("ignore")
     n_minor = round(math.sqrt(int(size) / 2))
-    level = round(math.log(int(size) / 10, 4))
     mesh = (
-        ltl.shapes.icosphere(level)
+        ltl.shapes.icosphere(level_of(int(size)))
         if kind == "icosphere"
         else ltl.shapes.jittered_torus(2 * n_minor, n_minor, 0.25, seed=0)
     )

@@ -1,0 +1,78 @@
+"""How cost grows with the number of vertices: a Markdown table, and the fitted slope of every column.
+
+python benchmarks/scaling.py [--sizes 10000 30000 100000 300000 1000000]
+
+A slope of 1 is linear cost. Small meshes live in caches and large ones do not, so that sums over slots slope a little
+more than that.
+"""
+
+import argparse
+import math
+import time
+import warnings
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from speed import compare, compiled, kinetics_of, start_of, step  # noqa: E402
+
+import ltljax as ltl  # noqa: E402
+
+SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of vertices, roughly")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    titles, rows = None, []
+    for size in arguments.sizes:
+        n_minor = round(math.sqrt(size / 2))
+        mesh = ltl.shapes.torus(n_major=2 * n_minor, n_minor=n_minor)
+        jittered = ltl.shapes.jittered_torus(2 * n_minor, n_minor, 0.25, seed=0)
+        found = {"build (s)": build(mesh), "build, jittered (s)": build(jittered), **run(mesh)}
+        if titles is None:
+            titles = tuple(found)
+            print("| vertices | " + " | ".join(titles) + " |\n" + "| --- " * (len(titles) + 1) + "|")
+        rows.append((mesh.num_vertices, *found.values()))
+        print(f"| {mesh.num_vertices} | " + " | ".join(f"{value:.3g}" for value in found.values()) + " |", flush=True)
+    counts, *columns = np.log(np.array(rows)).T
+    print("| slope | " + " | ".join(f"{np.polyfit(counts, column, 1)[0]:.2f}" for column in columns) + " |")
+
+
+def build(mesh):
+    _ = mesh.boundary_loops  # of the mesh, not of the surface
+    best = math.inf
+    for _ in range(3 if mesh.num_vertices < 200_000 else 1):
+        start = time.perf_counter()
+        ltl.Surface.from_mesh(mesh)
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def run(mesh):
+    """Milliseconds of a Laplacian, of a step of reaction-diffusion, and of its transposed derivative."""
+    surface = ltl.Surface.from_mesh(mesh, dtype=np.float32)
+    state, dt = start_of(surface)
+    u, kinetics = jnp.asarray(state), kinetics_of(surface)
+
+    def repeated(advance):
+        return lambda surface, u, v: jax.lax.scan(lambda v, _: (advance(surface, u, v), None), v, length=20)[0]
+
+    def backwards(surface, u, v):
+        return jax.vjp(lambda u: step(surface, u, dt, kinetics), u)[1](v)[0]
+
+    contestants = {
+        "Laplacian (ms)": compiled(repeated(lambda surface, u, v: dt * ltl.laplacian(surface, v)), surface, u, u)[0],
+        "step (ms)": compiled(repeated(lambda surface, u, v: step(surface, v, dt, kinetics)), surface, u, u)[0],
+        "step, reverse (ms)": compiled(repeated(backwards), surface, u, u)[0],
+    }
+    return {name: value / 20 for name, value in compare(contestants, rounds=5, inner=2).items()}
+
+
+if __name__ == "__main__":
+    main()
