@@ -148,7 +148,9 @@ def _over_species(weights: Array, u: Array) -> Array:
 
 contraction_p = Primitive("table_contraction")
 contraction_p.multiple_results = True
-contraction_p.def_impl(jax.jit(contraction_p.bind, static_argnames=("structure", "open_", "levels")))
+# Alone, outside of jit, there is nothing to be fused with.
+_evaluate_alone = functools.partial(_evaluate, settle=lambda table, values: values)
+contraction_p.def_impl(jax.jit(_evaluate_alone, static_argnames=("structure", "open_", "levels")))
 # On CPU these releases drop barriers before they fuse; the loop that holds there costs a copy of u.
 _DROPS_BARRIERS = jax.__version_info__ < (0, 11)
 for platform, settle in ((None, _settled), ("cpu", _settled_on_cpu))[: 1 + _DROPS_BARRIERS]:
@@ -158,7 +160,7 @@ for platform, settle in ((None, _settled), ("cpu", _settled_on_cpu))[: 1 + _DROP
 
 @contraction_p.def_abstract_eval
 def _(*leaves, **params):
-    shapes = jax.eval_shape(functools.partial(_evaluate, settle=lambda _, values: values, **params), *leaves)
+    shapes = jax.eval_shape(functools.partial(_evaluate_alone, **params), *leaves)
     return [jax.typeof(shape) for shape in shapes]
 
 
