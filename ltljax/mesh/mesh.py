@@ -233,9 +233,9 @@ class Mesh:
     def reordered(self) -> "Mesh":
         """The mesh with its vertices renumbered so that neighbours are near one another in memory.
 
-        Operators on a scan whose vertices come in no order run up to three times faster on it. Faces keep their order,
-        boundary loops their numbers; `pull` and `push` go on to lead from and to the data of the source, and
-        ``data[mesh.source_order]`` puts data of the new order back into that of the source.
+        Operators on a scan whose vertices come in no order run up to five times faster on it. Faces keep their order and
+        boundary loops their numbers, components may not; `pull` and `push` go on to lead from and to the data of the
+        source, and ``data[mesh.source_order]`` puts data of the new order back into that of the source.
         """
         order = topology.locality_order(self.faces, self.num_vertices)
         place = np.empty(self.num_vertices, np.int32)

@@ -6,16 +6,16 @@ With y left open it is the weighted sum of differences, applied to the field u; 
 applied to y; with w left open the derivative with respect to the weights. Derivatives of each are again T with one
 argument left open: the product rule fills a tangent in, and a transpose puts the cotangent where the output was and
 leaves open what was linear. So one primitive holds every derivative of every order, and because each of its three
-forms gathers (the transpose over the table's reverse) no derivative ever scatters.
+forms gathers (the transpose over the table's reverse, where there is one) no derivative ever adds by scattering.
 
-Why the loop has this shape (CPU, two cores; `benchmarks/speed.py` measures it, docs/hot_loop.md has the figures):
+Why the loop has this shape (CPU, two cores; docs/hot_loop.md has the figures):
 
 - Slot-major and unrolled over slots, a sum is one kernel: one pass over indices and weights, no (K, N) intermediate.
 - Differences, not a matrix with a diagonal: rounding is then relative to u[k] - u[v], which float32 needs on fine
   meshes.
 - What goes in and what comes out is settled in memory. Left to itself XLA fuses whatever computes u into every one of
-  the K gathers and computes it K times; two sums in a row take five times as long as they should, a Runge-Kutta step
-  with its derivative fifty times.
+  the K gathers and computes it K times; two sums in a row take four times as long as they should, a Runge-Kutta step
+  with its derivative forty times.
 - Indices are promised to be in bounds and not negative: the check for negative ones alone takes a fifth of the time.
 """
 
@@ -63,6 +63,7 @@ def difference_sum(
     """
     dtype = jnp.result_type(u, *weights)
     weights = tuple(jnp.asarray(block, dtype) for block in weights)
+    reverse = jax.tree.map(lambda values: jnp.asarray(values, dtype), reverse)
     (out,) = _contract(_Operands(table, weights, field=jnp.asarray(u, dtype), reverse=reverse), "rows")
     return out
 
@@ -70,25 +71,44 @@ def difference_sum(
 def differences(table: Table, u: Float[AnyArray, " V"]) -> tuple[Array, ...]:
     """``u[neighbour] - u[v]`` in every slot, one array per block; zero in an empty slot."""
     u = jnp.asarray(u)
+    if u.ndim != 1:
+        raise ValueError(
+            f"Expected one field of shape (V,), found {u.shape}: take the differences of each field apart."
+        )
     return tuple(_contract(_Operands(table, field=u, rows=jnp.ones_like(u)), "weights"))
 
 
-# Levels of batching, outermost first; each holds the names of the operands that have an axis for it, in front.
-_Levels = tuple[frozenset[str], ...]
+# Levels of batching, outermost first; each has its size and the names of the operands with an axis for it, in front.
+_Levels = tuple[tuple[int, frozenset[str]], ...]
 
 
 def _contract(operands: _Operands, open_: Argument, levels: _Levels = ()) -> list[Array]:
     leaves, structure = jax.tree.flatten(operands)
-    return contraction_p.bind(*leaves, structure=structure, open_=open_, levels=levels)
+    return contraction_p.bind(*_varying(leaves), structure=structure, open_=open_, levels=levels)
+
+
+def _varying(leaves: list[Any]) -> list[Any]:
+    """The leaves, inside `jax.shard_map` all varying over the axes that one of them varies over.
+
+    Operations of JAX see to that themselves, and so sum the cotangents of what was the same on every device; a
+    primitive must be handed it.
+    """
+    axes = [jax.typeof(leaf).mat.varying for leaf in leaves]
+    wanted = frozenset().union(*axes)
+    return [
+        jax.lax.pcast(leaf, tuple(wanted - here), to="varying") if wanted - here else leaf
+        for leaf, here in zip(leaves, axes, strict=True)
+    ]
 
 
 def _evaluate(*leaves, structure, open_: Argument, levels: _Levels, settle: Callable[..., Any]) -> list[Array]:
     """The contraction in plain JAX: what the primitive computes, abstractly and compiled."""
     function = functools.partial(_form, open_=open_, settle=settle)
-    for level in reversed(levels):
+    for size, level in reversed(levels):
         axes: Any = _Operands._make(0 if name in level else None for name in _Operands._fields)
-        function = jax.vmap(function, in_axes=(axes,))
-    return function(structure.unflatten(leaves))
+        function = jax.vmap(function, in_axes=(axes,), axis_size=size)
+    # As JAX's arrays: those of NumPy are for the host, which works on them piece by piece.
+    return function(structure.unflatten(map(jnp.asarray, leaves)))
 
 
 def _form(operands: _Operands, open_: Argument, settle: Callable[..., Any]) -> list[Array]:
@@ -138,6 +158,8 @@ def _row_sums(block: Block, weights: Array, u: Array) -> Array:
 
 def _products(block: Block, u: Array, y: Array) -> Array:
     here, centre = block.centre(y), block.centre(u)
+    if block.indices.shape[0] > _UNROLL:
+        return jnp.sum(here[None] * (block.neighbours(u) - centre[None]), axis=tuple(range(2, u.ndim + 1)))
     species = tuple(range(1, u.ndim))
     return jnp.stack([jnp.sum(here * (take(u, neighbours) - centre), axis=species) for neighbours in block.indices])
 
@@ -198,9 +220,9 @@ def _transpose(cotangents, *primals, structure, open_, levels):
     else:
         cotangents = [ad.instantiate_zeros(part) for part in cotangents]
         operands = _filled(structure.unflatten(primals), open_, cotangents, linear)
-        parts = _contract(operands, linear, tuple(level - {linear} | {open_} for level in levels))
+        parts = _contract(operands, linear, tuple((size, level - {linear} | {open_}) for size, level in levels))
         # Where the linear argument had no axis for a level, all of the level add up in it.
-        shared = tuple(axis for axis, level in enumerate(levels) if linear not in level)
+        shared = tuple(axis for axis, (_, level) in enumerate(levels) if linear not in level)
         parts = [jnp.sum(part, axis=shared) for part in parts] if shared else parts
     found = iter(parts)
     return [next(found) if name == linear else None for name, leaves in by_name.items() for _ in leaves]
@@ -218,7 +240,8 @@ def _batch(leaves, axes, *, structure, open_, levels):
         leaf if name not in batched else batching.bdim_at_front(leaf, axis, size)
         for name, leaf, axis in zip(names, leaves, axes, strict=True)
     ]
-    outs = contraction_p.bind(*moved, structure=structure, open_=open_, levels=(batched, *levels))
+    levels = ((size, batched), *levels)
+    outs = contraction_p.bind(*_varying(moved), structure=structure, open_=open_, levels=levels)
     return outs, [0] * len(outs)
 
 

@@ -146,8 +146,8 @@ def _pieces(block: Block, arguments: list[Any]):
 def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
     """The table of rows given as ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
 
-    The widths are chosen so that the slots held are the fewest: their number is at most the bulk's V * K, with K the
-    best width, plus twice the sum of the lengths of the longer rows.
+    The slots held are at most the bulk's V * K plus twice the sum of the lengths of the longer rows, and K is the width
+    for which that is least.
 
     Args:
         offsets: (V + 1,) integers.
