@@ -233,7 +233,7 @@ class Mesh:
     def reordered(self) -> "Mesh":
         """The mesh with its vertices renumbered so that neighbours are near one another in memory.
 
-        Operators on a scan whose vertices come in no order run up to five times faster on it. Faces keep their order and
+        On it operators on a scan in no order run up to five times faster. Faces keep their order and
         boundary loops their numbers, components may not; `pull` and `push` go on to lead from and to the data of the
         source, and ``data[mesh.source_order]`` puts data of the new order back into that of the source.
         """
