@@ -26,12 +26,34 @@ from .operators import (
     laplacian_matrix,
     weighted_laplacian,
 )
-from .solve import RKC2, GrowingModesWarning, Solution, SolveError, solve
+from .solve import (
+    RKC2,
+    RKL1,
+    SBDF2,
+    TRBDF2,
+    BackwardEuler,
+    CrankNicolson,
+    GrowingModesWarning,
+    Multigrid,
+    Solution,
+    SolveError,
+    Steady,
+    multigrid,
+    solve,
+)
 from .surface import InconsistentRowsWarning, Surface
 
 __version__ = _version("ltljax")
 
 __all__ = [
+    "multigrid",
+    "Steady",
+    "Multigrid",
+    "CrankNicolson",
+    "BackwardEuler",
+    "TRBDF2",
+    "SBDF2",
+    "RKL1",
     "RKC2",
     "Curvature",
     "Diffusion",

@@ -260,6 +260,14 @@ def laplacian_matrix(surface: Surface) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array(parts[0] + parts[1])
 
 
+def diagonal(surface: Surface) -> Float[Array, " V"]:
+    """What the Laplacian multiplies u with at the vertex itself; of `Paper`, whose matrix is not at hand, a bound."""
+    table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
+    if table is not None and weights is not None:
+        return -slot_sum(table, weights)
+    return jnp.full(surface.num_vertices, -spectral_bound(surface) / 2)
+
+
 def growth_rate(surface: Surface) -> float:
     """The largest real part among the Laplacian's eigenvalues, the constant field's zero aside where it is the largest
     (host). Positive where diffusion has growing modes; never with ``Monotone``.

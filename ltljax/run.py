@@ -125,7 +125,7 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
             solution = solve(equation, surface, u, t1, t0=t0, throw=False, rtol=_RTOL, atol=_ATOL)
             u = jax.block_until_ready(solution.u_end)
             reached.step_seconds += time.perf_counter() - start
-            for name, count in solution.stats.items():
+            for name, count in solution.counts.items():
                 reached.counts[name] = reached.counts.get(name, 0) + int(count)
             reached.times.append(float(solution.t_end))
             reached.states.append(np.asarray(u))

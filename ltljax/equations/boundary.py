@@ -4,6 +4,7 @@ What enters: conditions, the time and the state. What leaves: the fluxes they le
 Where nothing is said the normal derivative vanishes. Of two conditions for the same vertex the later one holds.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -124,6 +125,29 @@ def held_rate(
         _, change = jax.jvp(lambda s, c=condition: _data(c.value, s, surface, u), (at,), (jnp.ones_like(at),))
         rate = _where(condition, surface, change, rate)
     return rate
+
+
+def released(surface: Surface, conditions: Conditions, rate: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
+    """The rate of change, zero where Dirichlet conditions hold the state."""
+    for condition in _dirichlet(conditions):
+        rate = _where(condition, surface, jnp.zeros_like(rate), rate)
+    return rate
+
+
+def held_vertices(surface: Surface, conditions: Conditions) -> Bool[Array, " V"]:
+    """The vertices whose values Dirichlet conditions hold."""
+    masks = [_mask(condition.where, surface) for condition in _dirichlet(conditions)]
+    return functools.reduce(jnp.logical_or, masks, jnp.zeros(surface.num_vertices, bool))
+
+
+def absorption(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, " V"]:
+    """What Robin conditions take from -Delta u at each vertex, per unit of u; the mean over species."""
+    conditions = tuple(condition for condition in as_tuple(conditions) if not isinstance(condition, Dirichlet))
+    affine = lambda u: bounded_laplacian(surface, conditions, t, u)  # noqa: E731
+    taken = affine(jnp.zeros_like(u)) - affine(jnp.ones_like(u))
+    return jnp.mean(taken.reshape(surface.num_vertices, -1), axis=1)
 
 
 def stiffness(

@@ -32,13 +32,37 @@ class Diffusion(Equation):
 
     def rate(self, t, surface: Surface, u):
         """The time derivative D Delta u + g; of a value that is held, that value's."""
+        return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
+
+    def implicit_rate(self, t, surface: Surface, u):
+        """D Delta u with the fluxes through the boundary; of a value that is held, that value's rate."""
         u = self.held(t, surface, u)
-        diffusivity = jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
-        rate = diffusivity[None] * bounds.bounded_laplacian(surface, self.boundary, t, u)
-        if self.source is not None:
-            source = self.source(t, surface.vertices) if callable(self.source) else self.source
-            rate = rate + jnp.asarray(source, u.dtype)
-        return bounds.held_rate(surface, self.boundary, t, u, rate)
+        diffused = bounds.bounded_laplacian(surface, self.boundary, t, u)
+        return bounds.held_rate(surface, self.boundary, t, u, self.diffusivities(u)[None] * diffused)
+
+    def explicit_rate(self, t, surface: Surface, u):
+        """The source g; zero where a value is held."""
+        if self.source is None:
+            return jnp.zeros_like(u)
+        source = self.source(t, surface.vertices) if callable(self.source) else self.source
+        source = jnp.asarray(source, u.dtype)
+        if source.shape != u.shape:
+            raise ValueError(f"Expected a source of the shape of the state, {u.shape}, found {source.shape}.")
+        return bounds.released(surface, self.boundary, source)
+
+    def diffusivities(self, u):
+        """D for every species."""
+        return jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
+
+    @property
+    def is_affine(self) -> bool:
+        """It is."""
+        return True
+
+    @property
+    def conditions(self):
+        """The boundary conditions."""
+        return bounds.as_tuple(self.boundary)
 
     def held(self, t, surface: Surface, u):
         """The state with the values that the boundary conditions hold."""
@@ -47,4 +71,4 @@ class Diffusion(Equation):
     def spectral_bound(self, t, surface: Surface, u):
         """The largest diffusivity times the bound of the Laplacian's eigenvalues."""
         bound = spectral_bound(surface) + bounds.stiffness(surface, self.boundary, t, u)
-        return jnp.max(jnp.asarray(self.diffusivity, u.dtype)) * bound
+        return jnp.max(jnp.abs(self.diffusivities(u))) * bound

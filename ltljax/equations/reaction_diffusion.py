@@ -42,11 +42,27 @@ class ReactionDiffusion(Equation):
 
     def rate(self, t, surface: Surface, u):
         """The time derivative: diffusion of every species and the reaction at every vertex."""
+        return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
+
+    def implicit_rate(self, t, surface: Surface, u):
+        """The diffusion of every species; of a value that is held, that value's rate."""
         self._check(u)
         u = self.held(t, surface, u)
         diffused = bounds.bounded_laplacian(surface, self.boundary, t, u)
-        rate = self.diffusivity.astype(u.dtype)[None] * diffused + self.reaction(u)
-        return bounds.held_rate(surface, self.boundary, t, u, rate)
+        return bounds.held_rate(surface, self.boundary, t, u, self.diffusivities(u)[None] * diffused)
+
+    def explicit_rate(self, t, surface: Surface, u):
+        """The reaction at every vertex; zero where a value is held."""
+        return bounds.released(surface, self.boundary, self.reaction(self.held(t, surface, u)))
+
+    def diffusivities(self, u):
+        """One number for each species."""
+        return self.diffusivity.astype(u.dtype)
+
+    @property
+    def conditions(self):
+        """The boundary conditions."""
+        return bounds.as_tuple(self.boundary)
 
     def held(self, t, surface: Surface, u):
         """The state with the values that the boundary conditions hold."""

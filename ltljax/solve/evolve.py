@@ -1,27 +1,35 @@
 """`solve`: an equation, a surface and an initial state become a trajectory. The door to diffrax."""
 
+import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..equations import Equation
+from ..equations import boundary as bounds
 from ..lifting.schemes import Paper, Polynomial
 from ..operators import growth_rate, spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
-from .chebyshev import RKC2
+from . import checks
+from .implicit import SBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
+from .multigrid import Multigrid, is_available, multigrid
+from .stabilised import RKC2
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
 _OVERFLOW = 1e6
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
+
+Condition = Callable[[Array, Array, Array], Bool[Array, ""]]
 
 
 class SolveError(RuntimeError):
@@ -42,6 +50,21 @@ class GrowingModesWarning(UserWarning):
     """The Laplacian of a surface has eigenvalues with positive real part, so that diffusion can grow."""
 
 
+class Steady(eqx.Module):
+    """A condition to stop at: the root mean square of the rate is at most ``tolerance`` times that of the state.
+
+    Attributes:
+        tolerance: per unit of time.
+    """
+
+    tolerance: float = 1e-6
+
+    def __call__(self, t, u, rate) -> Bool[Array, ""]:
+        """Whether the state is steady."""
+        del t
+        return jnp.linalg.norm(rate) <= self.tolerance * jnp.maximum(jnp.linalg.norm(u), 1e-30)
+
+
 class Solution(eqx.Module):
     """A trajectory.
 
@@ -50,18 +73,35 @@ class Solution(eqx.Module):
         us: (T, V) or (T, V, S) the states at these times.
         t_end: the time reached.
         u_end: the state there.
-        stats: numbers of steps and, with `RKC2`, of evaluations of the rate.
+        counts: numbers of steps and, with `RKC2` and `RKL1`, of evaluations of the rate.
         result: `diffrax.RESULTS`; an overflow is not a failure of the solver and shows in ``overflowed`` instead.
         overflowed: whether the state became NaN, infinite, or a million times its start.
+        stopped: whether ``stop_when`` held.
+        interpolation: of a dense solution, from which `at` reads.
+        method: the solver, and why it was taken.
     """
 
     ts: Float[Array, " T"]
     us: Float[Array, "T V *S"]
     t_end: Float[Array, ""]
     u_end: Float[Array, "V *S"]
-    stats: dict[str, Array]
+    counts: dict[str, Array]
     result: diffrax.RESULTS
     overflowed: Array
+    stopped: Array
+    interpolation: diffrax.DenseInterpolation | None
+    method: str = eqx.field(static=True)
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """The solver and why it was taken, and the counts."""
+        return {"solver": self.method, **self.counts}
+
+    def at(self, t: ArrayLike) -> Float[Array, "V *S"]:
+        """The state at any time up to ``t_end``, of a solution made with ``dense=True``."""
+        if self.interpolation is None:
+            raise ValueError("The solution is not dense. Call ltl.solve(..., dense=True, max_steps=...).")
+        return self.interpolation.evaluate(jnp.asarray(t, self.us.dtype))
 
     def check(self, surface: Surface) -> None:
         """Raise `SolveError`, with causes and cures, where the run did not reach its end."""
@@ -89,17 +129,27 @@ def solve(
     progress: bool | diffrax.AbstractProgressMeter = False,
     *,
     t0: ArrayLike = 0.0,
+    dt: float | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
     max_steps: int | None = 1_000_000,
+    stop_when: Condition | None = None,
+    dense: bool = False,
+    preconditioner: Multigrid | None = None,
     throw: bool = True,
 ) -> Solution:
     """The solution of an evolution equation at given times.
 
-    Steps are adaptive; the error is measured in a root-mean-square norm over vertices and species, which does not
-    depend on the size of the mesh. The default solver is `RKC2` for ``Monotone`` surfaces, whose diffusion has
-    eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for ``Paper`` ones, of which
-    neither is true.
+    Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
+    species, which does not depend on the size of the mesh. The default solver is `RKC2` for ``Monotone`` surfaces, whose
+    diffusion has eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for ``Paper``
+    ones, of which neither is true. ``solution.stats`` says which it was and why.
+
+    Solvers: any explicit one of diffrax; `RKC2` (second order) and `RKL1` (first, with the maximum principle), explicit
+    and stabilised; `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`, `5`, implicit;
+    `diffrax.KenCarp3`, `4`, `5`, `diffrax.Sil3` and `SBDF2` (fixed steps), diffusion implicit and the reaction explicit.
+    Implicit stages are solved by Krylov iteration, preconditioned by multigrid with the extra `amg` and by Jacobi's
+    method without; no matrix of the size of the state is formed, in derivatives neither.
 
     Args:
         equation: what is solved, such as `Diffusion` or `ReactionDiffusion`.
@@ -107,13 +157,22 @@ def solve(
         u0: the state at t0, (V,) or (V, S); taken in the float type of the surface.
         t1: the last time.
         ts: the times at which to keep the state, ascending; by default t1 alone.
-        solver: a diffrax solver.
-        adjoint: how reverse-mode derivatives go through time; by default diffrax's recursive checkpointing.
+        solver: a solver.
+        adjoint: how derivatives go through time; by default diffrax's recursive checkpointing, for derivatives in
+            reverse mode with the memory of a logarithm of ``max_steps`` states; `diffrax.ForwardMode()` for few
+            parameters.
         progress: True for a progress bar, or a diffrax progress meter.
         t0: the first time.
-        rtol: relative tolerance of a step.
+        dt: the length of steps, for fixed ones; the last before each of ``ts`` may be shorter.
+        rtol: relative tolerance of a step; implicit stages are solved to a hundredth of it.
         atol: absolute tolerance of a step.
         max_steps: steps after which the run counts as failed; None for no limit, which reverse-mode derivatives refuse.
+        stop_when: ``(t, u, rate) -> bool``; the run ends with the first step after which it holds: `Steady`, or your
+            own.
+        dense: whether to keep every step, so that ``solution.at(t)`` gives the state at any time. Takes the memory of
+            ``max_steps`` states.
+        preconditioner: what `multigrid` returned for this surface or a similar one, where it is not to be set up anew:
+            for surfaces that are being traced.
         throw: whether to raise when the run does not reach t1. Inside jit nothing can be raised: read
             ``solution.result`` and ``solution.overflowed`` there.
 
@@ -122,28 +181,36 @@ def solve(
 
     Raises:
         SolveError: the state overflowed, or the solver failed before t1.
-        ValueError: the state does not fit the surface.
+        ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative, times are not
+            in order, dt is beyond the stability of an explicit solver, or solver and dt do not go together.
 
     Warns:
         GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
             once for each surface, and not inside jit.
     """
     u0 = jnp.asarray(u0, surface.dtype)
-    if u0.ndim not in (1, 2) or u0.shape[0] != surface.num_vertices:
-        raise ValueError(
-            f"Expected an initial state of shape ({surface.num_vertices},) or ({surface.num_vertices}, S), "
-            f"found {u0.shape}."
-        )
+    checks.state(surface, u0)
+    times = jnp.asarray([t1] if ts is None else ts, surface.dtype)
+    checks.times(t0, t1, times, dt)
+    checks.finite(equation, u0)
     if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
         _warn_of_growth(surface)
-    # Time in the state's own float type: diffrax multiplies the two.
-    time = surface.dtype
-    ts = jnp.asarray([t1] if ts is None else ts, time)
+    method = default_solver(surface) if solver is None else without_matrices(solver)
+    why = _reason(surface) if solver is None else "chosen by the caller"
+    if isinstance(method, SBDF2) and dt is None:
+        raise ValueError("SBDF2 takes fixed steps: give their length as dt, or use diffrax.KenCarp3().")
+    if isinstance(method, ImplicitRungeKutta | SBDF2):
+        hierarchy = _hierarchy(equation, surface, u0, t0) if preconditioner is None else preconditioner
+        method = dataclasses.replace(method, preconditioning=Preconditioning(hierarchy, rtol, atol))
+        why += f", stages preconditioned by {'Jacobi' if hierarchy is None else 'multigrid'}"
+    elif dt is not None:
+        checks.step(equation, surface, u0, t0, dt, method)
     solution = _solve(
-        equation, surface, u0, jnp.asarray(t0, time), jnp.asarray(t1, time), ts,
-        default_solver(surface) if solver is None else solver,
+        # Time in the state's own float type: diffrax multiplies the two.
+        equation, surface, u0, jnp.asarray(t0, surface.dtype), jnp.asarray(t1, surface.dtype), times, method,
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-        _meter(progress), rtol, atol, max_steps,
+        _meter(progress), rtol, atol, _grid(t0, t1, times, dt), max_steps, stop_when, dense,
+        f"{type(method if solver is None else solver).__name__}: {why}",
     )  # fmt: skip
     if throw and not isinstance(solution.t_end, Tracer):
         solution.check(surface)
@@ -152,7 +219,45 @@ def solve(
 
 def default_solver(surface: Surface) -> diffrax.AbstractSolver:
     """The solver `solve` takes by itself."""
-    return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKC2(_bound)
+    return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKC2()
+
+
+def _reason(surface: Surface) -> str:
+    if isinstance(surface.scheme, Paper):
+        return "the published operator has eigenvalues off the real axis and no cheap bound of them"
+    return "explicit, with as many stages as the stiffness asks for"
+
+
+def _hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) -> Multigrid | None:
+    """The multigrid of the surface under the equation's conditions, where it can be had."""
+    if surface.is_traced or not is_available():
+        return None
+    time = jnp.asarray(t0, surface.dtype)
+    conditions = equation.conditions
+    is_held = bounds.held_vertices(surface, conditions)
+    absorption = bounds.absorption(surface, conditions, time, u0) if conditions else jnp.zeros(surface.num_vertices)
+    if isinstance(is_held, Tracer):
+        return None
+    # Where the data of conditions are being traced their absorption is left out: a preconditioner may be off.
+    absorption = None if isinstance(absorption, Tracer) else np.maximum(np.asarray(absorption), 0)
+    return multigrid(surface, absorption, np.asarray(is_held))
+
+
+def _grid(t0: ArrayLike, t1: ArrayLike, ts: Array, dt: float | None) -> Array | None:
+    """The times of fixed steps: multiples of dt, and the times asked for; None for adaptive steps."""
+    if dt is None:
+        return None
+    if any(isinstance(value, Tracer) for value in (t0, t1, ts, dt)):
+        raise ValueError("Fixed steps need their times to be known: t0, t1, ts and dt cannot be traced by JAX.")
+    dtype = ts.dtype
+    start, end = float(t0), float(t1)  # type: ignore
+    count = int(np.ceil((end - start) / dt - 1e-9))
+    times = np.concatenate([start + dt * np.arange(count), np.asarray(ts, np.float64), [end]])
+    times = np.unique(times[(times >= start) & (times <= end)])
+    # A time asked for stands in place of the multiple of dt that it is but for rounding.
+    keep = np.concatenate([np.diff(times) > 1e-6 * dt, [True]])
+    keep[0] = True
+    return jnp.asarray(times[keep], dtype)
 
 
 def _warn_of_growth(surface: Surface) -> None:
@@ -171,11 +276,6 @@ def _rate(t, u, args):
     return equation.rate(t, surface, u)
 
 
-def _bound(t, u, args):
-    equation, surface = args
-    return equation.spectral_bound(t, surface, u)
-
-
 def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractProgressMeter:
     if isinstance(progress, diffrax.AbstractProgressMeter):
         return progress
@@ -188,7 +288,9 @@ def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractPr
 
 
 @eqx.filter_jit
-def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, max_steps) -> Solution:
+def _solve(
+    equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense, method
+) -> Solution:
     u0 = equation.held(t0, surface, u0)
     largest = _OVERFLOW * jnp.maximum(1, jnp.max(jnp.abs(u0)))
 
@@ -197,10 +299,21 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
         del t, args
         return ~(jnp.max(jnp.abs(y)) <= largest)
 
-    bound = equation.spectral_bound(t0, surface, u0)
-    # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
-    dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), t1 - t0)
-    keeps_state = isinstance(solver, RKC2)
+    def is_to_stop(t, y, args, **_):
+        equation, surface = args
+        return stop_when(t, y, equation.rate(t, surface, y))
+
+    events = {"overflowed": has_overflowed} | ({} if stop_when is None else {"stopped": is_to_stop})
+    if grid is not None:
+        controller, dt0 = diffrax.StepTo(ts=grid), None
+    else:
+        controller = diffrax.PIDController(rtol=rtol, atol=atol)
+        bound = equation.spectral_bound(t0, surface, u0)
+        # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
+        dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), t1 - t0)
+        if isinstance(solver, ImplicitRungeKutta):  # whose interpolation is linear
+            controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
+    keeps_state = hasattr(solver, "spectral_bound")
     out = diffrax.diffeqsolve(
         diffrax.ODETerm(_rate),
         solver,
@@ -209,10 +322,12 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
         dt0,
         u0,
         (equation, surface),
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], solver_state=keeps_state),
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+        saveat=diffrax.SaveAt(
+            subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], solver_state=keeps_state, dense=dense
+        ),
+        stepsize_controller=controller,
         adjoint=adjoint,
-        event=diffrax.Event(has_overflowed),
+        event=diffrax.Event(events),
         max_steps=max_steps,
         throw=False,
         progress_meter=meter,
@@ -221,10 +336,14 @@ def _solve(equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol
     # The integrated rate of a held value ends near the value; what is handed out is the value.
     us = jax.vmap(lambda t, u: equation.held(t, surface, u))(ts, us)
     u_end = jax.vmap(lambda t, u: equation.held(t, surface, u))(t_end, u_end)
-    stats = {name: out.stats[name] for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    counts = {name: out.stats[name] for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     if keeps_state:
-        stats["num_evaluations"] = cast(Any, out.solver_state)[1]
-    return Solution(ts, us, t_end[0], u_end[0], stats, out.result, cast(Array, out.event_mask))
+        counts["num_evaluations"] = cast(Any, out.solver_state)[1]
+    happened = cast(dict[str, Array], out.event_mask)
+    stopped = happened.get("stopped", jnp.array(False))
+    return Solution(
+        ts, us, t_end[0], u_end[0], counts, out.result, happened["overflowed"], stopped, out.interpolation, method
+    )
 
 
 def _cause_of_overflow(surface: Surface) -> str:

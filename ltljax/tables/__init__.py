@@ -17,6 +17,7 @@ from .table import (
     reverse_weights,
     reversible,
     slot_sum,
+    weighted_table,
 )
 
 __all__ = [
@@ -33,4 +34,5 @@ __all__ = [
     "reverse_weights",
     "reversible",
     "slot_sum",
+    "weighted_table",
 ]

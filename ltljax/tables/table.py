@@ -157,6 +157,18 @@ def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
     return Table(tuple(_laid_out(rows, offsets, neighbours, lengths) for rows in _division(lengths)))
 
 
+def weighted_table(matrix: scipy.sparse.csr_array) -> tuple[Table, tuple[np.ndarray, ...]]:
+    """The entries of a square sparse matrix off its diagonal, as a table and its weights (host)."""
+    entries = scipy.sparse.coo_array(matrix)
+    is_off = (entries.row != entries.col) & (entries.data != 0)
+    rows, columns, values = entries.row[is_off], entries.col[is_off], entries.data[is_off]
+    order = np.argsort(rows, kind="stable")
+    lengths = np.bincount(rows, minlength=entries.shape[0])
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    weights = tuple(_slots(part, offsets, values[order], lengths, 0.0) for part in _division(lengths))
+    return build_table(offsets, columns[order]), weights
+
+
 def reversible(table: Table) -> Table:
     """The table with its reverse (host)."""
     owners, users, positions, start = [], [], [], 0
@@ -215,13 +227,20 @@ def _division(lengths: np.ndarray):
 
 def _laid_out(part, offsets, values, lengths, empty=None) -> Block:
     """A block of the values of rows; an empty slot holds the row's own index, or ``empty``."""
+    rows, _ = part
+    empty = (np.arange(len(lengths)) if rows is None else rows) if empty is None else empty
+    held = _slots(part, offsets, values, lengths, empty)
+    return Block(held.astype(np.int32), None if rows is None else rows.astype(np.int32))
+
+
+def _slots(part, offsets, values, lengths, empty) -> np.ndarray:
+    """The values of rows in the slots of a block, (K, N)."""
     rows, width = part
     own = np.arange(len(lengths)) if rows is None else rows
     slot = np.arange(width)[:, None]
     used = slot < np.where(lengths[own] <= width, lengths[own], 0)
     position = np.minimum(offsets[own] + slot, max(len(values) - 1, 0))
-    held = np.where(used, values[position] if len(values) else 0, own if empty is None else empty)
-    return Block(held.astype(np.int32), None if rows is None else rows.astype(np.int32))
+    return np.where(used, values[position] if len(values) else 0, empty)
 
 
 def slot_sum(table: Table, weights: tuple[AnyArray, ...]) -> AnyArray:

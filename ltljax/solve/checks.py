@@ -1,0 +1,114 @@
+"""What is wrong with a run before it starts: each mistake one clear error (host)."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike
+
+from ..equations import Equation
+from ..surface import Surface
+
+# Products with the rate's derivative from which the stiffest mode is estimated.
+_PRODUCTS = 30
+
+
+def state(surface: Surface, u0: Array) -> None:
+    """Raise where a state does not fit the surface."""
+    if u0.ndim not in (1, 2) or u0.shape[0] != surface.num_vertices:
+        raise ValueError(
+            f"Expected a state of shape ({surface.num_vertices},) or ({surface.num_vertices}, S), found {u0.shape}."
+        )
+
+
+def times(t0: ArrayLike, t1: ArrayLike, ts: Array, dt: float | None) -> None:
+    """Raise where the times of a run are not in order."""
+    if dt is not None and not isinstance(dt, Tracer) and not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"Expected a positive length of steps, found dt = {dt}.")
+    if any(isinstance(value, Tracer) for value in (t0, t1, ts)):
+        return
+    start, end, asked = (np.asarray(value, ts.dtype) for value in (t0, t1, ts))
+    if not (np.isfinite(start) and np.isfinite(end) and end >= start):
+        raise ValueError(f"Expected t1 at or after t0, found t0 = {start} and t1 = {end}.")
+    if asked.ndim != 1:
+        raise ValueError(f"Expected ts as a list of times, found an array of shape {asked.shape}.")
+    is_bad = ~((asked >= start) & (asked <= end))
+    if is_bad.any():
+        first = int(np.flatnonzero(is_bad)[0])
+        raise ValueError(f"Expected ts between t0 = {start} and t1 = {end}, found ts[{first}] = {asked[first]}.")
+    falls = np.flatnonzero(np.diff(asked) < 0)
+    if len(falls):
+        first = int(falls[0])
+        raise ValueError(
+            f"Expected ts in ascending order, found ts[{first + 1}] = {asked[first + 1]} after {asked[first]}."
+        )
+
+
+def finite(equation: Equation, u0: Array) -> None:
+    """Raise where the initial state or the numbers of an equation are not finite, or a diffusivity is negative."""
+    if not isinstance(u0, Tracer):
+        is_bad = ~np.isfinite(np.asarray(u0))
+        if is_bad.any():
+            at = np.argwhere(is_bad)[0]
+            raise ValueError(f"The initial state is {np.asarray(u0)[tuple(at)]} at vertex {at[0]}.")
+        diffusivities = equation.diffusivities(u0)
+        if not isinstance(diffusivities, Tracer) and (np.asarray(diffusivities) < 0).any():
+            raise ValueError(
+                f"Expected diffusivities that are not negative, found {np.asarray(diffusivities)}: diffusion backwards in "
+                "time is not well posed."
+            )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(equation):
+        if isinstance(leaf, Tracer) or not isinstance(leaf, float | np.ndarray | jax.Array):
+            continue
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise ValueError(f"The equation's{jax.tree_util.keystr(path)} is not finite.")
+
+
+def step(
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, dt: float, solver: diffrax.AbstractSolver
+) -> None:
+    """Raise where steps of an explicit Runge-Kutta method are too long for the stiffest mode of the first state."""
+    leaves = jax.tree.leaves((equation, surface, u0, t0, dt))
+    if not isinstance(solver, diffrax.AbstractERK | diffrax.Euler) or any(isinstance(x, Tracer) for x in leaves):
+        return
+    reach, stiffest = real_stability(solver), _stiffest(equation, surface, u0, jnp.asarray(t0, u0.dtype))
+    if dt * stiffest > 1.02 * reach:
+        raise ValueError(
+            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {reach / stiffest:.2g} on this "
+            "surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKC2() or ltl.TRBDF2()."
+        )
+
+
+@jax.jit
+def _power_iteration(equation: Equation, surface: Surface, u0: Array, t0: Array, v: Array) -> Array:
+    def product(_, v):
+        change = jax.jvp(lambda u: equation.rate(t0, surface, u), (u0,), (v / jnp.linalg.norm(v),))[1]
+        return change
+
+    return jnp.linalg.norm(jax.lax.fori_loop(0, _PRODUCTS, product, v))
+
+
+def _stiffest(equation: Equation, surface: Surface, u0: Array, t0: Array) -> float:
+    """The magnitude of the largest eigenvalue of the rate's derivative, from below."""
+    start = jnp.asarray(np.random.default_rng(0).normal(size=u0.shape), u0.dtype)
+    return float(_power_iteration(equation, surface, u0, t0, start))
+
+
+def real_stability(solver: diffrax.AbstractSolver) -> float:
+    """How far along the negative real axis an explicit Runge-Kutta method is stable."""
+    if isinstance(solver, diffrax.Euler):
+        return 2.0
+    tableau = solver.tableau  # type: ignore
+    size = len(tableau.b_sol)
+    a = np.zeros((size, size))
+    for row, values in enumerate(tableau.a_lower, start=1):
+        a[row, :row] = values
+    reach = np.arange(1e-3, 50, 1e-3)
+    # R(-x) = 1 - x b (I + x a)^-1 1, a polynomial since a is nilpotent.
+    moments, powers = [], np.ones(size)
+    for _ in range(size):
+        moments.append(tableau.b_sol @ powers)
+        powers = a @ powers
+    growth = 1 + sum(moment * (-reach) ** (k + 1) for k, moment in enumerate(moments))
+    return float(reach[np.argmax(np.abs(growth) > 1 + 1e-9)])
