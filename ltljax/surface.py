@@ -314,7 +314,9 @@ def _freeze(
         loops=np.repeat(np.arange(len(loops), dtype=np.int32), [len(loop) for loop in loops]),
         jet=ring,
         diffusion=None,
+        components=mesh.components,
         num_loops=len(loops),
+        num_components=int(mesh.components.max()) + 1,
     )
     laps.end("rings")
     if isinstance(scheme, Paper):

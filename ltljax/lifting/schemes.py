@@ -83,7 +83,9 @@ class Topology(eqx.Module):
         kinds: (V,) `INTERIOR`, `SMOOTH` boundary, `RIGHT_CORNER` or `OTHER_CORNER`, see `lifting.jets`.
         boundary: (B,) the vertices on the boundary, loop by loop.
         loops: (B,) the number of the boundary loop each of them lies on.
+        components: (V,) the connected component of each vertex.
         num_loops: how many loops there are.
+        num_components: how many components there are.
         jet: the neighbours of the gradient's fit.
         diffusion: the neighbours of the Laplacian; None where it is the divergence of the gradient.
     """
@@ -96,7 +98,9 @@ class Topology(eqx.Module):
     loops: Int[AnyArray, " B"]
     jet: Table
     diffusion: Table | None
+    components: Int[AnyArray, " V"]
     num_loops: int = eqx.field(static=True, default=0)
+    num_components: int = eqx.field(static=True, default=1)
 
 
 class Geometry(eqx.Module):

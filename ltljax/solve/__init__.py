@@ -1,9 +1,12 @@
 """How it is solved: time stepping through diffrax, the steppers diffrax lacks, linear systems and multigrid."""
 
+from .distance import geodesic_distance
 from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
+from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
 from .stabilised import RKC2, RKL1
+from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
 
 __all__ = [
     "RKC2",
@@ -12,11 +15,18 @@ __all__ = [
     "TRBDF2",
     "BackwardEuler",
     "CrankNicolson",
+    "Eigenmodes",
     "GrowingModesWarning",
+    "IncompatibleSourceWarning",
     "Multigrid",
     "Solution",
     "SolveError",
     "Steady",
+    "eigenmodes",
+    "geodesic_distance",
     "multigrid",
+    "poisson",
+    "screened_poisson",
     "solve",
+    "steady_state",
 ]

@@ -55,8 +55,8 @@ def finite(equation: Equation, u0: Array) -> None:
         diffusivities = equation.diffusivities(u0)
         if not isinstance(diffusivities, Tracer) and (np.asarray(diffusivities) < 0).any():
             raise ValueError(
-                f"Expected diffusivities that are not negative, found {np.asarray(diffusivities)}: diffusion backwards in "
-                "time is not well posed."
+                f"Expected diffusivities that are not negative, found {np.asarray(diffusivities)}: diffusion backwards "
+                "in time is not well posed."
             )
     for path, leaf in jax.tree_util.tree_leaves_with_path(equation):
         if isinstance(leaf, Tracer) or not isinstance(leaf, float | np.ndarray | jax.Array):
@@ -75,8 +75,8 @@ def step(
     reach, stiffest = real_stability(solver), _stiffest(equation, surface, u0, jnp.asarray(t0, u0.dtype))
     if dt * stiffest > 1.02 * reach:
         raise ValueError(
-            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {reach / stiffest:.2g} on this "
-            "surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKC2() or ltl.TRBDF2()."
+            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {reach / stiffest:.2g} on "
+            "this surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKC2() or ltl.TRBDF2()."
         )
 
 

@@ -33,14 +33,14 @@ Condition = Callable[[Array, Array, Array], Bool[Array, ""]]
 
 
 class SolveError(RuntimeError):
-    """A run that could not be carried to its end.
+    """A run that could not be carried to its end, or a system that could not be solved.
 
     Attributes:
-        time: the time reached.
+        time: the time reached, of a run.
         solution: what was computed until then.
     """
 
-    def __init__(self, message: str, time: float, solution: "Solution"):
+    def __init__(self, message: str, time: float = float("nan"), solution: "Solution | None" = None):
         super().__init__(message)
         self.time = time
         self.solution = solution
@@ -141,15 +141,15 @@ def solve(
     """The solution of an evolution equation at given times.
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
-    species, which does not depend on the size of the mesh. The default solver is `RKC2` for ``Monotone`` surfaces, whose
-    diffusion has eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for ``Paper``
-    ones, of which neither is true. ``solution.stats`` says which it was and why.
+    species, which does not depend on the size of the mesh. The default solver is `RKC2` for ``Monotone`` surfaces,
+    whose diffusion has eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for
+    ``Paper`` ones, of which neither is true. ``solution.stats`` says which it was and why.
 
-    Solvers: any explicit one of diffrax; `RKC2` (second order) and `RKL1` (first, with the maximum principle), explicit
-    and stabilised; `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`, `5`, implicit;
-    `diffrax.KenCarp3`, `4`, `5`, `diffrax.Sil3` and `SBDF2` (fixed steps), diffusion implicit and the reaction explicit.
-    Implicit stages are solved by Krylov iteration, preconditioned by multigrid with the extra `amg` and by Jacobi's
-    method without; no matrix of the size of the state is formed, in derivatives neither.
+    Solvers: any explicit one of diffrax; `RKC2` (second order) and `RKL1` (first, with the maximum principle),
+    explicit and stabilised; `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`, `5`, implicit;
+    `diffrax.KenCarp3`, `4`, `5`, `diffrax.Sil3` and `SBDF2` (fixed steps), diffusion implicit and the reaction
+    explicit. Implicit stages are solved by Krylov iteration, preconditioned by multigrid with the extra `amg` and by
+    Jacobi's method without; no matrix of the size of the state is formed, in derivatives neither.
 
     Args:
         equation: what is solved, such as `Diffusion` or `ReactionDiffusion`.
@@ -181,8 +181,8 @@ def solve(
 
     Raises:
         SolveError: the state overflowed, or the solver failed before t1.
-        ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative, times are not
-            in order, dt is beyond the stability of an explicit solver, or solver and dt do not go together.
+        ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative, times are
+            not in order, dt is beyond the stability of an explicit solver, or solver and dt do not go together.
 
     Warns:
         GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
@@ -200,9 +200,9 @@ def solve(
     if isinstance(method, SBDF2) and dt is None:
         raise ValueError("SBDF2 takes fixed steps: give their length as dt, or use diffrax.KenCarp3().")
     if isinstance(method, ImplicitRungeKutta | SBDF2):
-        hierarchy = _hierarchy(equation, surface, u0, t0) if preconditioner is None else preconditioner
-        method = dataclasses.replace(method, preconditioning=Preconditioning(hierarchy, rtol, atol))
-        why += f", stages preconditioned by {'Jacobi' if hierarchy is None else 'multigrid'}"
+        inverse = hierarchy(equation, surface, u0, t0) if preconditioner is None else preconditioner
+        method = dataclasses.replace(method, preconditioning=Preconditioning(inverse, rtol, atol))
+        why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
         checks.step(equation, surface, u0, t0, dt, method)
     solution = _solve(
@@ -228,7 +228,7 @@ def _reason(surface: Surface) -> str:
     return "explicit, with as many stages as the stiffness asks for"
 
 
-def _hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) -> Multigrid | None:
+def hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) -> Multigrid | None:
     """The multigrid of the surface under the equation's conditions, where it can be had."""
     if surface.is_traced or not is_available():
         return None

@@ -1,8 +1,8 @@
 """Implicit and implicit-explicit steppers, whose stages are solved by preconditioned Krylov iteration.
 
-What enters: the stiff part of an equation, a tableau, and a `Preconditioning`. What leaves: diffrax solvers. diffrax has
-most of these methods itself, but solves their stages, and differentiates through them, with matrices of the size of
-the state.
+What enters: the stiff part of an equation, a tableau, and a `Preconditioning`. What leaves: diffrax solvers. diffrax
+has most of these methods itself, but solves their stages, and differentiates through them, with matrices of the size
+of the state.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Linear systems without a matrix: BiCGStab as a lineax solver, whose preconditioner knows its own transpose.
 
-What enters: an operator, a right side and a `Preconditioner`. What leaves: the solution, with the derivatives that lineax
-gives it (the solution of the same system, or of its transpose, for another right side).
+What enters: an operator, a right side and a `Preconditioner`. What leaves: the solution, with the derivatives that
+lineax gives it (the solution of the same system, or of its transpose, for another right side).
 """
 
 import abc
@@ -106,6 +106,58 @@ class BiCGStab(lx.AbstractLinearSolver):
     def assume_full_rank(self):
         """Singular systems are made regular before they come here."""
         return True
+
+
+class GMRES(lx.AbstractLinearSolver):
+    """lineax's GMRES with a preconditioner that knows its own transpose: for operators that are not definite.
+
+    Attributes:
+        tolerance: of the root mean square of the residual, relative to that of the right side.
+        preconditioner: an approximate inverse.
+        restart: directions that are kept; as many states of memory.
+        max_steps: iterations after which the solve has failed.
+    """
+
+    tolerance: Array | float = 1e-8
+    preconditioner: Preconditioner = Identity()
+    restart: int = eqx.field(static=True, default=60)
+    max_steps: int = eqx.field(static=True, default=300)
+
+    def _inner(self, dtype) -> lx.GMRES:
+        tolerance = jnp.asarray(self.tolerance, dtype)
+        return lx.GMRES(0.0, tolerance, _rms, self.max_steps, self.restart, self.max_steps)
+
+    def init(self, operator, options):
+        """The operator, which is not looked into."""
+        del options
+        return lx.linearise(operator), False
+
+    def compute(self, state, vector, options):
+        """The solution, whether it was found, and the number of iterations."""
+        del options
+        operator, transposed = state
+        size = jnp.maximum(_rms(vector), jnp.finfo(vector.dtype).tiny)
+        inverse = lx.FunctionLinearOperator(lambda r: self.preconditioner(r, transposed), operator.in_structure())
+        inner = self._inner(vector.dtype)
+        x, result, stats = inner.compute(inner.init(operator, {}), vector / size, {"preconditioner": inverse})
+        return x * size, result, stats
+
+    def transpose(self, state, options):
+        """The transposed operator, for which the preconditioner is transposed too."""
+        operator, transposed = state
+        return (operator.transpose(), not transposed), options
+
+    def conj(self, state, options):
+        """The same: everything is real."""
+        return state, options
+
+    def assume_full_rank(self):
+        """Singular systems are made regular before they come here."""
+        return True
+
+
+def _rms(x: Array) -> Array:
+    return jnp.sqrt(jnp.mean(x**2))
 
 
 def linear_solve(

@@ -31,8 +31,9 @@ from ..tables import ReverseWeights, Table, difference_sum, reverse_weights, rev
 
 # A level of so many vertices is solved by its eigenvectors.
 _COARSEST = 400
-# Two sweeps of Jacobi before and after on the finest level, damped by the inverse Chebyshev nodes of [0.5, 2], the upper
-# three quarters of the range of a random walk's eigenvalues; one on the others, where two gain a sixth and cost twice.
+# Two sweeps of Jacobi before and after on the finest level, damped by the inverse Chebyshev nodes of [0.5, 2], the
+# upper three quarters of the range of a random walk's eigenvalues; one on the others, where two gain a sixth and cost
+# twice.
 _FINE_DAMPING = tuple(float(1 / (1.25 + 0.75 * np.cos(np.pi * angle))) for angle in (0.25, 0.75))
 _COARSE_DAMPING = 0.8
 # Sweeps of the transposed Laplacian from the vertex areas towards the measure it conserves.
@@ -178,9 +179,7 @@ def is_available() -> bool:
     return importlib.util.find_spec("pyamg") is not None
 
 
-def multigrid(
-    surface: Surface, absorption: np.ndarray | None = None, is_held: np.ndarray | None = None
-) -> Multigrid:
+def multigrid(surface: Surface, absorption: np.ndarray | None = None, is_held: np.ndarray | None = None) -> Multigrid:
     """The hierarchy of a surface, set up once for its weights (host) and kept as long as they live.
 
     Args:

@@ -1,0 +1,329 @@
+"""Stationary states: the Poisson and the screened Poisson equation, and where the rate of an equation vanishes.
+
+What enters: a surface, and a right side or an equation with a first state. What leaves: fields, with derivatives by the
+implicit function theorem.
+"""
+
+import warnings
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from ..equations import Diffusion, Equation
+from ..equations import boundary as bounds
+from ..lifting.schemes import Monotone
+from ..operators import spectral_bound
+from ..surface import Surface
+from ..tables import AnyArray
+from . import checks
+from .evolve import SolveError, Steady, hierarchy, solve
+from .implicit import Preconditioning
+from .krylov import GMRES, linear_solve
+from .multigrid import Multigrid
+
+# A right side whose mean is more than this share of its size was not meant to have none.
+_INCOMPATIBLE = 1e-2
+_MAX_MARCH = 500
+_MAX_NEWTON = 5
+# Of the steps in time towards a stationary state, in units of the reaction's time.
+_LONGEST = 1e4
+
+
+class IncompatibleSourceWarning(UserWarning):
+    """The right side of a Poisson equation has a mean, so that there is no solution."""
+
+
+def poisson(
+    surface: Surface,
+    f: Float[AnyArray, "V *S"],
+    boundary: bounds.Conditions | None = None,
+    *,
+    tolerance: float | None = None,
+    preconditioner: Multigrid | None = None,
+    throw: bool = True,
+) -> Float[Array, "V *S"]:
+    """The solution of Delta u = f: second order with ``Monotone``, fourth with ``Polynomial(degree=4)``.
+
+    Where nothing on a connected component holds or absorbs u, a solution exists only for an f without mean (in
+    ``surface.mass``), and then up to a constant: the mean of f over the component is taken off, which is said if it is
+    more than a hundredth of f, and the u whose mean (in the vertex areas) is zero is returned.
+
+    By Krylov iteration preconditioned by multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many
+    more iterations), and differentiable in f, the data of the conditions and, with a ``preconditioner``, the vertices.
+
+    Args:
+        surface: the surface.
+        f: (V,) or (V, S).
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivative vanishes.
+        tolerance: of the residual, relative to f; by default 1e-10 for float64 and 1e-5 for float32.
+        preconditioner: what `multigrid` returned for this surface or a similar one, where the surface is being traced.
+        throw: whether to raise when the iteration does not converge. Inside jit nothing can be raised.
+
+    Raises:
+        SolveError: the iteration did not converge.
+        ValueError: f does not fit the surface or is not finite.
+
+    Warns:
+        IncompatibleSourceWarning: f has a mean where it must have none.
+    """
+    return _elliptic(surface, f, 0.0, boundary, tolerance, preconditioner, throw)
+
+
+def screened_poisson(
+    surface: Surface,
+    f: Float[AnyArray, "V *S"],
+    screening: Float[AnyArray, "*V"] | float = 1.0,
+    boundary: bounds.Conditions | None = None,
+    *,
+    tolerance: float | None = None,
+    preconditioner: Multigrid | None = None,
+    throw: bool = True,
+) -> Float[Array, "V *S"]:
+    """The solution of Delta u - c u = f for a screening c > 0, a number or (V,): see `poisson`."""
+    if not isinstance(screening, Tracer) and not (np.asarray(screening) > 0).all():
+        raise ValueError(
+            f"Expected a positive screening, found {np.asarray(screening).min()}; for none use ltl.poisson."
+        )
+    return _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
+
+
+def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw):
+    f = jnp.asarray(f, surface.dtype)
+    checks.state(surface, f)
+    if not isinstance(f, Tracer) and not np.isfinite(np.asarray(f)).all():
+        raise ValueError(f"The right side is not finite at vertex {np.argwhere(~np.isfinite(np.asarray(f)))[0][0]}.")
+    equation = Diffusion(1.0, source=-f, boundary=() if boundary is None else boundary)
+    preconditioner = hierarchy(equation, surface, f, 0.0) if preconditioner is None else preconditioner
+    tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
+    screening = jnp.broadcast_to(jnp.asarray(screening, f.dtype), f.shape[:1])
+    start = jnp.zeros_like(f)
+    u, mean, converged, steps = _stationary(equation, surface, start, screening, preconditioner, tolerance)
+    if not isinstance(u, Tracer):
+        _say_incompatible(mean, f)
+        if throw and not bool(converged):
+            raise SolveError(_unconverged(int(steps), preconditioner))
+    return u
+
+
+def _say_incompatible(mean: Array, f: Array) -> None:
+    worst, size = float(jnp.max(jnp.abs(mean))), float(jnp.sqrt(jnp.mean(f**2)))
+    if worst > _INCOMPATIBLE * size:
+        warnings.warn(
+            f"The right side has a mean of {worst:.3g} (its root mean square is {size:.3g}) over a component where "
+            "nothing holds u, so that no solution exists. The equation was solved for the right side without its mean.",
+            IncompatibleSourceWarning,
+            stacklevel=4,
+        )
+
+
+def _unconverged(steps: int, preconditioner: Multigrid | None) -> str:
+    cure = 'Install the extra "amg" for multigrid' if preconditioner is None else "Raise the tolerance, or use float64"
+    return f"The linear system was not solved within {steps} iterations. {cure}."
+
+
+@eqx.filter_jit
+def _stationary(
+    equation: Diffusion, surface: Surface, start: Array, screening: Array, multigrid: Multigrid | None, tolerance: Any
+) -> tuple[Array, Array, Array, Array]:
+    """The u with ``rate(u) = screening u``, the means taken off, whether it was found, and in how many iterations."""
+    time = jnp.zeros((), start.dtype)
+    start = equation.held(time, surface, start)
+    trailing = (1,) * (start.ndim - 1)
+    is_held = bounds.held_vertices(surface, equation.conditions)
+    lost = bounds.absorption(surface, equation.conditions, time, start) + screening
+    fixes = jnp.where(is_held, 1.0, jnp.abs(lost))
+    diffusivities = equation.diffusivities(start)
+    scale = 1.0 if multigrid is None else multigrid.smallest
+
+    def rate(u):
+        return equation.rate(time, surface, u) - jnp.where(is_held, 0, screening).reshape(-1, *trailing) * u
+
+    # Constants on a component where nothing fixes u are moved to the smallest eigenvalue. The solution then has the
+    # mean that a compatible right side would not give it: with m^T L = 0, scale * mean = m^T f / |m|.
+    is_free = _over_components(surface, fixes, jax.ops.segment_max) <= 0
+
+    def means(u):
+        areas = surface.vertex_areas.reshape(-1, *trailing)
+        total = _over_components(surface, surface.vertex_areas)
+        mean = _over_components(surface, areas * u) / total.reshape(-1, *trailing)
+        return jnp.where(is_free.reshape(-1, *trailing), mean, 0)
+
+    def spread(means):
+        return means[surface.topology.components] * scale * diffusivities
+
+    value, derivative = jax.linearize(rate, start)
+
+    def apply(change):
+        return spread(means(change)) - derivative(change) + jnp.where(is_held.reshape(-1, *trailing), change, 0)
+
+    right = jnp.where(is_held.reshape(-1, *trailing), 0, value)
+    flat = diffusivities.reshape(-1) if trailing else diffusivities[None]
+    alpha = jnp.broadcast_to(jnp.mean(screening), flat.shape)
+    inverse = Preconditioning(multigrid).of(surface, alpha, flat)
+    found = linear_solve(apply, right, inverse, tolerance, 200 if multigrid is not None else 20_000)
+    constants = means(found.value)
+    u = start + found.value - jnp.where(
+        is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
+    )  # fmt: skip
+    return u, constants * scale * diffusivities, found.result == lx.RESULTS.successful, found.stats["num_steps"]
+
+
+def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum) -> Array:
+    return reduce(values, surface.topology.components, num_segments=surface.topology.num_components)
+
+
+def steady_state(
+    equation: Equation,
+    surface: Surface,
+    u0: Float[AnyArray, "V *S"],
+    method: Literal["newton", "marching"] = "newton",
+    *,
+    t: ArrayLike = 0.0,
+    tolerance: float = 1e-8,
+    t1: float = 1e4,
+    preconditioner: Multigrid | None = None,
+    throw: bool = True,
+) -> Float[Array, "V *S"]:
+    """A state at which the rate of an equation vanishes.
+
+    `Diffusion` is one linear system; where it conserves mass (nothing holds or absorbs), the state has the mass of u0.
+    Of a nonlinear equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
+    rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
+    state is steady, then takes Newton's last step. Differentiable in reverse and forward mode by the implicit function
+    theorem, in everything but u0.
+
+    Args:
+        equation: the equation.
+        surface: the surface.
+        u0: where to start.
+        method: ``"newton"`` or ``"marching"``.
+        t: the time at which sources and boundary data are taken.
+        tolerance: of the root mean square of the rate, relative to that of the state, per unit of time.
+        t1: of ``"marching"``, the time not to run beyond.
+        preconditioner: what `multigrid` returned for this surface or a similar one, where the surface is being traced.
+        throw: whether to raise when no such state is found. Inside jit nothing can be raised.
+
+    Raises:
+        SolveError: no stationary state was found, or there is none.
+
+    Source: Kelley and Keyes (1998), Convergence analysis of pseudo-transient continuation,
+    doi:10.1137/S0036142996304796.
+    """
+    u0 = jnp.asarray(u0, surface.dtype)
+    checks.state(surface, u0)
+    checks.finite(equation, u0)
+    if method not in ("newton", "marching"):
+        raise ValueError(f'Expected the method "newton" or "marching", found {method!r}.')
+    preconditioner = hierarchy(equation, surface, u0, t) if preconditioner is None else preconditioner
+    time = jnp.asarray(t, surface.dtype)
+    if isinstance(equation, Diffusion):
+        return _steady_diffusion(equation, surface, u0, time, preconditioner, throw)
+    if method == "marching":
+        stopping = Steady(min(1e-4, 1e3 * tolerance))
+        u0 = solve(equation, surface, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
+    u, rate, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
+    if throw and not isinstance(u, Tracer):
+        wanted = tolerance * float(jnp.sqrt(jnp.mean(u**2)))
+        if not float(rate) <= max(10 * wanted, 1e3 * float(jnp.finfo(u.dtype).eps) * float(spectral_bound(surface))):
+            raise SolveError(
+                f"No stationary state was found: after {int(steps)} steps the rate is {float(rate):.2g}, expected at "
+                f"most {wanted:.2g}. Causes are (a) a state that oscillates or travels for ever, (b) a start too far "
+                'away: try method="marching", or (c) a tolerance beyond the float type.'
+            )
+    return u
+
+
+def _steady_diffusion(equation: Diffusion, surface: Surface, u0: Array, time: Array, preconditioner, throw: bool):
+    # The data at this time, from here on without one.
+    source = equation.explicit_rate(time, surface, u0)
+    still = eqx.tree_at(lambda e: e.source, equation, source, is_leaf=lambda x: x is None)
+    none = jnp.zeros(surface.num_vertices, u0.dtype)
+    tolerance = 1e-11 if u0.dtype == jnp.float64 else 1e-5
+    u, mean, converged, steps = _stationary(still, surface, u0, none, preconditioner, tolerance)
+    if not isinstance(u, Tracer) and throw:
+        if not bool(converged):
+            raise SolveError(_unconverged(int(steps), preconditioner))
+        size = float(jnp.sqrt(jnp.mean(source**2)))
+        if float(jnp.max(jnp.abs(mean))) > _INCOMPATIBLE * max(size, 1e-30):
+            raise SolveError(
+                f"There is no stationary state: the source has a mean of {float(jnp.max(jnp.abs(mean))):.3g} and "
+                "nothing takes it away, so that u grows for ever. Take the mean off, or hold u on a boundary."
+            )
+    conserved = surface.mass if isinstance(surface.scheme, Monotone) and not surface.is_traced else surface.vertex_areas
+    has_conditions = any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions)
+    if has_conditions:
+        return u
+    lost = _over_components(surface, conserved.reshape(-1, *(1,) * (u.ndim - 1)) * (u0 - u))
+    total = _over_components(surface, conserved).reshape(-1, *(1,) * (u.ndim - 1))
+    return u + (lost / total)[surface.topology.components]
+
+
+@eqx.filter_jit
+def _newton(equation, surface, u0, time, multigrid, tolerance):
+    preconditioning = Preconditioning(multigrid)
+    u0 = equation.held(time, surface, u0)
+    diffusivities = equation.diffusivities(u0)
+    flat = diffusivities.reshape(-1)
+    stiffness = equation.spectral_bound(time, surface, u0)
+    reaction = jnp.maximum(stiffness - jnp.max(flat) * spectral_bound(surface), 0)
+
+    def rms(u):
+        return jnp.sqrt(jnp.mean(u**2))
+
+    def rate(u):
+        return equation.rate(time, surface, u)
+
+    dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, 1e-6))
+
+    def inverse(shift):
+        alpha = jnp.broadcast_to(shift + reaction / 4, flat.shape)
+        return jax.lax.stop_gradient(preconditioning.of(surface, alpha, flat))
+
+    def march(carry):
+        u, value, dt, steps = carry
+        _, derivative = jax.linearize(rate, u)
+        operator = lx.FunctionLinearOperator(lambda d: d / dt - derivative(d), jax.eval_shape(lambda: u))
+        found = lx.linear_solve(operator, value, GMRES(1e-3, inverse(1 / dt)), throw=False)
+        change = rms(found.value) / jnp.maximum(rms(u), 1e-30)
+        # Steps that change the state by a tenth; one that changes it by half is taken back.
+        is_good = (change < 0.5) & (found.result == lx.RESULTS.successful)
+        growth = jnp.where(is_good, jnp.clip(0.1 / jnp.maximum(change, 1e-30), 0.2, 3.0), 0.2)
+        proposed = jnp.where(is_good, u + found.value, u)
+        # No longer than what settles all but neutral modes, such as a pattern's turning on a sphere: those would make
+        # the system singular.
+        return proposed, rate(proposed), jnp.minimum(dt * growth, _LONGEST * dt0), steps + 1
+
+    def goes_on(carry):
+        u, value, _, steps = carry
+        return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH)
+
+    frozen = jax.lax.stop_gradient((u0, rate(u0), dt0))
+    u, _, _, steps = jax.lax.while_loop(goes_on, march, (*frozen, jnp.zeros((), jnp.int32)))
+    u = jax.lax.stop_gradient(u)
+
+    def residual(u, args):
+        return args(u)
+
+    exact = GMRES(1e-10 if u.dtype == jnp.float64 else 1e-5, inverse(0.0))
+    found = optx.root_find(
+        residual,
+        optx.Newton(
+            jnp.asarray(tolerance, u.dtype), jnp.asarray(tolerance, u.dtype), optx.rms_norm, linear_solver=exact
+        ),
+        u,
+        eqx.filter_closure_convert(rate, u),
+        max_steps=_MAX_NEWTON,
+        adjoint=optx.ImplicitAdjoint(exact),
+        throw=False,
+    )
+    # Where Newton's last steps did not help, what the march found stands.
+    is_better = rms(rate(found.value)) <= rms(rate(u))
+    u = jnp.where(is_better, found.value, u)
+    return u, rms(rate(u)), steps
