@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "operators": {"surface", "tables"},
     "elliptic": {"surface", "lifting", "mesh", "tables", "progress"},
     "equations": {"operators", "surface", "tables"},
-    "solve": {"equations", "operators", "surface", "tables", "lifting"},
+    "solve": {"equations", "operators", "surface", "tables", "lifting", "mesh"},
     "output": set(),
     "scenario": {"mesh", "lifting", "equations", "operators", "surface", "solve"},
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},

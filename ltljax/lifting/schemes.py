@@ -152,8 +152,13 @@ def ring_normals(
 
 
 def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
-    """The neighbours of a block's rows, seen from their vertex."""
-    return block.neighbours(vertices) - block.centre(vertices)[None]
+    """The neighbours of a block's rows, seen from their vertex; exactly zero in an empty slot.
+
+    Of a vertex whose position is computed in the same jit, XLA may compute the position anew for each side of the
+    difference and round it differently, and a slot that is nearly empty would count as a neighbour.
+    """
+    seen = block.neighbours(vertices) - block.centre(vertices)[None]
+    return seen.__array_namespace__().where(block.is_used[..., None], seen, 0)
 
 
 def fitted_normals(

@@ -5,6 +5,7 @@ from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
 from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
+from .restart import RestartError
 from .stabilised import RKC2, RKL1
 from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
 
@@ -19,6 +20,7 @@ __all__ = [
     "GrowingModesWarning",
     "IncompatibleSourceWarning",
     "Multigrid",
+    "RestartError",
     "Solution",
     "SolveError",
     "Steady",

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..equations import Equation
 from ..surface import Surface
+from ..tables import AnyArray
 
 # Products with the rate's derivative from which the stiffest mode is estimated.
 _PRODUCTS = 30
@@ -22,7 +23,7 @@ def state(surface: Surface, u0: Array) -> None:
         )
 
 
-def times(t0: ArrayLike, t1: ArrayLike, ts: Array, dt: float | None) -> None:
+def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
     """Raise where the times of a run are not in order."""
     if dt is not None and not isinstance(dt, Tracer) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"Expected a positive length of steps, found dt = {dt}.")

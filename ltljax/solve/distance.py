@@ -39,7 +39,9 @@ def geodesic_distance(
     Source: Crane, Weischedel and Wardetzky (2013), Geodesics in heat, doi:10.1145/2516971.2516977.
     """
     if surface.is_traced:
-        raise ValueError("The distance is computed on the host, but the surface is being traced by a JAX transformation.")
+        raise ValueError(
+            "The distance is computed on the host, but the surface is being traced by a JAX transformation."
+        )
     sources = np.atleast_1d(np.asarray(sources))
     if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
         raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")

@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, cast
 
 import diffrax
@@ -22,12 +23,16 @@ from ..tables import AnyArray
 from . import checks
 from .implicit import SBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .multigrid import Multigrid, is_available, multigrid
+from .restart import Keeper, fingerprint, in_intervals
 from .stabilised import RKC2
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
 _OVERFLOW = 1e6
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
+
+# Intervals of a run that is kept on disk.
+_INTERVALS = 20
 
 Condition = Callable[[Array, Array, Array], Bool[Array, ""]]
 
@@ -136,6 +141,9 @@ def solve(
     stop_when: Condition | None = None,
     dense: bool = False,
     preconditioner: Multigrid | None = None,
+    checkpoint_dir: str | Path | None = None,
+    checkpoint_every: float | None = None,
+    resume: bool = False,
     throw: bool = True,
 ) -> Solution:
     """The solution of an evolution equation at given times.
@@ -173,6 +181,12 @@ def solve(
             ``max_steps`` states.
         preconditioner: what `multigrid` returned for this surface or a similar one, where it is not to be set up anew:
             for surfaces that are being traced.
+        checkpoint_dir: a folder in which to keep the state as the run goes. The run is then made of intervals that each
+            begin with a first step, and a run that is killed loses at most the last of them. Not inside jit.
+        checkpoint_every: the length of these intervals in time, which also end at ``ts``; by default a twentieth of the
+            run.
+        resume: whether to go on from what ``checkpoint_dir`` holds of the same call; the result is the same as that of
+            a run that was not interrupted.
         throw: whether to raise when the run does not reach t1. Inside jit nothing can be raised: read
             ``solution.result`` and ``solution.overflowed`` there.
 
@@ -183,6 +197,7 @@ def solve(
         SolveError: the state overflowed, or the solver failed before t1.
         ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative, times are
             not in order, dt is beyond the stability of an explicit solver, or solver and dt do not go together.
+        RestartError: ``checkpoint_dir`` holds the files of another run.
 
     Warns:
         GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
@@ -190,7 +205,10 @@ def solve(
     """
     u0 = jnp.asarray(u0, surface.dtype)
     checks.state(surface, u0)
-    times = jnp.asarray([t1] if ts is None else ts, surface.dtype)
+    # In NumPy where they are known, which inside jit they would not be as JAX's arrays.
+    times = [t1] if ts is None else ts
+    is_known = not any(isinstance(time, Tracer) for time in jax.tree.leaves(times))
+    times = (np if is_known else jnp).asarray(times, surface.dtype)
     checks.times(t0, t1, times, dt)
     checks.finite(equation, u0)
     if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
@@ -205,13 +223,33 @@ def solve(
         why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
         checks.step(equation, surface, u0, t0, dt, method)
-    solution = _solve(
+    name = f"{type(method if solver is None else solver).__name__}: {why}"
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    grid = _grid(t0, t1, times, dt)
+
+    def advance(u, begin, end, times, grid):
         # Time in the state's own float type: diffrax multiplies the two.
-        equation, surface, u0, jnp.asarray(t0, surface.dtype), jnp.asarray(t1, surface.dtype), times, method,
-        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-        _meter(progress), rtol, atol, _grid(t0, t1, times, dt), max_steps, stop_when, dense,
-        f"{type(method if solver is None else solver).__name__}: {why}",
-    )  # fmt: skip
+        begin, end = jnp.asarray(begin, surface.dtype), jnp.asarray(end, surface.dtype)
+        return _solve(
+            equation, surface, u, begin, end, times, method, adjoint, _meter(progress), rtol, atol, grid, max_steps,
+            stop_when, dense, name,
+        )  # fmt: skip
+
+    if checkpoint_dir is None:
+        solution = advance(u0, t0, t1, times, grid)
+    else:
+        if dense or any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, t1, times))):
+            raise ValueError("A run that is kept on disk cannot be traced by a JAX transformation, nor be dense.")
+        run = dict(
+            mesh=fingerprint((surface.vertices, surface.faces, repr(surface.scheme))),
+            equation=fingerprint(equation),
+            start=fingerprint((u0, float(t0))),  # type: ignore
+            end=fingerprint((float(t1), times, dt, checkpoint_every)),  # type: ignore
+            solver=fingerprint((name, rtol, atol, stop_when)),
+        )
+        keeper = Keeper(checkpoint_dir, run, resume)
+        every = (float(t1) - float(t0)) / _INTERVALS if checkpoint_every is None else checkpoint_every  # type: ignore
+        solution = in_intervals(advance, keeper, u0, float(t0), float(t1), times, grid, every)  # type: ignore
     if throw and not isinstance(solution.t_end, Tracer):
         solution.check(surface)
     return solution
@@ -243,7 +281,7 @@ def hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) ->
     return multigrid(surface, absorption, np.asarray(is_held))
 
 
-def _grid(t0: ArrayLike, t1: ArrayLike, ts: Array, dt: float | None) -> Array | None:
+def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.ndarray | None:
     """The times of fixed steps: multiples of dt, and the times asked for; None for adaptive steps."""
     if dt is None:
         return None
@@ -257,7 +295,8 @@ def _grid(t0: ArrayLike, t1: ArrayLike, ts: Array, dt: float | None) -> Array | 
     # A time asked for stands in place of the multiple of dt that it is but for rounding.
     keep = np.concatenate([np.diff(times) > 1e-6 * dt, [True]])
     keep[0] = True
-    return jnp.asarray(times[keep], dtype)
+    # A run of no length has no steps, whatever theirs.
+    return times[keep].astype(dtype) if keep.sum() > 1 else None
 
 
 def _warn_of_growth(surface: Surface) -> None:

@@ -43,6 +43,7 @@ class BiCGStab(lx.AbstractLinearSolver):
         tolerance: of the residual, relative.
         preconditioner: an approximate inverse.
         max_steps: iterations after which the solve has failed.
+        absolute: a root mean square of the residual that is small enough, whatever the right side.
 
     Source: van der Vorst (1992), Bi-CGSTAB, doi:10.1137/0913035.
     """
@@ -50,6 +51,7 @@ class BiCGStab(lx.AbstractLinearSolver):
     tolerance: Array | float = 1e-8
     preconditioner: Preconditioner = Identity()
     max_steps: int = eqx.field(static=True, default=200)
+    absolute: Array | float = 0.0
 
     def init(self, operator, options):
         """The operator, which is not looked into."""
@@ -61,7 +63,8 @@ class BiCGStab(lx.AbstractLinearSolver):
         del options
         operator, transposed = state
         size = jnp.sqrt(jnp.sum(vector**2))
-        goal = jnp.asarray(self.tolerance, vector.dtype) * size
+        enough = jnp.asarray(self.absolute, vector.dtype) * vector.size**0.5
+        goal = jnp.maximum(jnp.asarray(self.tolerance, vector.dtype) * size, enough)
         tiny = jnp.finfo(vector.dtype).tiny
         shadow = vector
 

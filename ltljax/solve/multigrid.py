@@ -27,7 +27,16 @@ from ..lifting.schemes import Monotone, PerBlock
 from ..mesh import Mesh
 from ..operators import laplacian_matrix
 from ..surface import Surface
-from ..tables import ReverseWeights, Table, difference_sum, reverse_weights, reversible, slot_sum, weighted_table
+from ..tables import (
+    AnyArray,
+    ReverseWeights,
+    Table,
+    difference_sum,
+    reverse_weights,
+    reversible,
+    slot_sum,
+    weighted_table,
+)
 
 # A level of so many vertices is solved by its eigenvectors.
 _COARSEST = 400
@@ -53,7 +62,7 @@ class Interpolation(eqx.Module):
     table: Table
     shares: PerBlock
     reverse: ReverseWeights
-    coarse: Int[Array, " C"]
+    coarse: Int[AnyArray, " C"]
 
     def prolong(self, u: Float[Array, "C S"]) -> Float[Array, "V S"]:
         """A field of the next level on this one."""
@@ -81,8 +90,8 @@ class Level(eqx.Module):
 
     table: Table
     conductances: PerBlock
-    masses: Float[Array, " V"]
-    absorption: Float[Array, " V"]
+    masses: Float[AnyArray, " V"]
+    absorption: Float[AnyArray, " V"]
     down: Interpolation
 
     def apply(self, alpha: Array, beta: Array, u: Float[Array, "V S"]) -> Float[Array, "V S"]:
@@ -115,13 +124,13 @@ class Multigrid(eqx.Module):
     table: Table
     weights: PerBlock
     reverse: ReverseWeights | None
-    absorption: Float[Array, " V"]
-    is_free: Float[Array, " V"]
-    measure: Float[Array, " V"]
+    absorption: Float[AnyArray, " V"]
+    is_free: Float[AnyArray, " V"]
+    measure: Float[AnyArray, " V"]
     down: Interpolation
     levels: tuple[Level, ...]
-    eigenvalues: Float[Array, " C"]
-    eigenvectors: Float[Array, "C C"]
+    eigenvalues: Float[AnyArray, " C"]
+    eigenvectors: Float[AnyArray, "C C"]
 
     def apply(self, alpha: Array, beta: Array, u: Float[Array, "V S"]) -> Float[Array, "V S"]:
         """``alpha u - beta Delta u`` with what is absorbed; the identity where values are held."""

@@ -43,6 +43,12 @@ class Block(eqx.Module):
     indices: Int[AnyArray, "K N"]
     rows: Int[AnyArray, " N"] | None
 
+    @property
+    def is_used(self) -> AnyArray:
+        """Which slots hold a neighbour, (K, N) bool: an empty one holds its own row."""
+        own = np.arange(self.indices.shape[1], dtype=np.int32) if self.rows is None else self.rows
+        return self.indices != own[None]
+
     def centre(self, values: AnyArray) -> AnyArray:
         """The values at this block's own rows: (V, ...) -> (N, ...)."""
         return values if self.rows is None else take(values, self.rows)

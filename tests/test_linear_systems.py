@@ -1,0 +1,267 @@
+"""Linear systems and what is made of them: multigrid, Poisson, stationary states, eigenmodes, geodesic distance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.special import jn_zeros
+
+import ltljax as ltl
+from ltljax.solve.implicit import Preconditioning
+from ltljax.solve.krylov import linear_solve
+
+MESHES = {
+    "icosphere": lambda n: ltl.shapes.icosphere({2500: 4, 40000: 6, 160000: 7}[n]),
+    "jittered": lambda n: ltl.shapes.jittered_sphere({2500: 4, 40000: 6, 160000: 7}[n], 0.5, seed=0),
+    "random": lambda n: ltl.shapes.random_sphere({2500: 2562, 40000: 40962, 160000: 163842}[n], seed=0),
+    "torus": lambda n: ltl.shapes.torus(n_major=2 * round((n / 2) ** 0.5), n_minor=round((n / 2) ** 0.5)),
+}
+
+
+def iterations(surface, dt, tolerance):
+    hierarchy = ltl.multigrid(surface)
+    b = jnp.asarray(np.random.default_rng(0).normal(size=surface.num_vertices))
+
+    @jax.jit
+    def run(surface, hierarchy, b):
+        one = jnp.ones(1, b.dtype)
+        inverse = Preconditioning(hierarchy).of(surface, one, dt * one)
+        found = linear_solve(lambda u: u - dt * ltl.laplacian(surface, u), b, inverse, tolerance)
+        rest = found.value - dt * ltl.laplacian(surface, found.value) - b
+        return found.stats["num_steps"], jnp.linalg.norm(rest) / jnp.linalg.norm(b)
+
+    steps, residual = run(surface, hierarchy, b)
+    assert residual < 2 * tolerance
+    return int(steps)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_iterations_do_not_grow_with_the_mesh(kind):
+    surface = ltl.Surface.from_mesh(MESHES[kind](2500))
+    assert iterations(surface, 1.0, 1e-8) < 12
+    assert iterations(surface, 1e-2, 1e-8) < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [40000, 160000])
+@pytest.mark.parametrize("kind", MESHES)
+def test_iterations_do_not_grow_with_the_mesh_up_to_160_000_vertices(kind, size):
+    surface = ltl.Surface.from_mesh(MESHES[kind](size))
+    assert iterations(surface, 1.0, 1e-8) < (20 if kind == "random" else 15)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(3, 0.3, seed=0))
+
+
+def test_the_cycle_for_the_transpose_is_the_transposed_cycle(sphere):
+    hierarchy = ltl.multigrid(sphere)
+    random = np.random.default_rng(0)
+    r, s = (jnp.asarray(random.normal(size=(sphere.num_vertices, 2))) for _ in range(2))
+    alpha, beta = jnp.array([1.0, 0.3]), jnp.array([0.1, 2.0])
+    forth = jnp.sum(s * hierarchy(alpha, beta, r))
+    back = jnp.sum(r * hierarchy(alpha, beta, s, transposed=True))
+    np.testing.assert_allclose(forth, back, rtol=1e-10)
+
+
+def test_poisson_is_of_second_order_and_leaves_no_residual():
+    errors = []
+    for level in (3, 4):
+        surface = ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(level, 0.3, seed=0))
+        exact = surface.vertices.prod(axis=1)
+        exact = exact - ltl.integrate(surface, exact) / jnp.sum(surface.vertex_areas)
+        f = -12 * surface.vertices.prod(axis=1)
+        found = ltl.poisson(surface, f)
+        f = f - ltl.integrate(surface, f, surface.mass) / jnp.sum(surface.mass)
+        assert jnp.linalg.norm(ltl.laplacian(surface, found) - f) < 1e-9 * jnp.linalg.norm(f)
+        assert abs(ltl.integrate(surface, found)) < 1e-10
+        errors.append(jnp.linalg.norm(found - exact) / jnp.linalg.norm(exact))
+    assert np.log2(errors[0] / errors[1]) > 1.7
+    assert errors[1] < 5e-3
+
+
+def test_high_order_is_solved_with_the_multigrid_of_monotone():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4), ltl.Polynomial(degree=4))
+    u = surface.vertices.prod(axis=1)
+    found = ltl.screened_poisson(surface, -13 * u)
+    assert jnp.linalg.norm(found - u) < 5e-5 * jnp.linalg.norm(u)
+
+
+def test_a_right_side_with_a_mean_is_said(sphere):
+    x1 = sphere.vertices[:, 0]
+    with pytest.warns(ltl.IncompatibleSourceWarning, match=r"mean of 0\.5"):
+        shifted = ltl.poisson(sphere, x1 + 0.5)
+    np.testing.assert_allclose(shifted, ltl.poisson(sphere, x1), atol=1e-8)
+
+
+def test_every_component_has_its_own_mean():
+    one = ltl.shapes.icosphere(2)
+    both = ltl.Mesh(
+        np.concatenate([one.vertices, one.vertices + 5]), np.concatenate([one.faces, one.faces + one.num_vertices])
+    )
+    surface = ltl.Surface.from_mesh(both)
+    x1 = jnp.asarray(np.tile(one.vertices[:, 0], 2) * np.repeat([1.0, 3.0], one.num_vertices))
+    found = ltl.poisson(surface, x1).reshape(2, -1)
+    alone = ltl.poisson(ltl.Surface.from_mesh(one), jnp.asarray(one.vertices[:, 0]))
+    np.testing.assert_allclose(found, np.stack([alone, 3 * alone]), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "condition", [ltl.Dirichlet(1.0), ltl.Robin(1.0, 1.0, 3.0), (ltl.Neumann(2.0), ltl.Dirichlet(1.0, where=0))]
+)
+def test_poisson_on_a_disk_keeps_its_conditions(condition):
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk())
+    squared = jnp.sum(surface.vertices**2, axis=1)
+    np.testing.assert_allclose(ltl.poisson(surface, 0 * squared + 4, condition), squared, atol=1e-8)
+
+
+def test_poisson_is_differentiated_in_both_modes(sphere):
+    x = sphere.vertices
+    f = jnp.cos(2 * x[:, 0])
+    f = f - ltl.integrate(sphere, f, sphere.mass) / jnp.sum(sphere.mass)
+    check_grads(lambda f: jnp.sin(ltl.poisson(sphere, f)), (f,), order=1, modes=("fwd", "rev"), rtol=1e-5, atol=1e-5)
+    hierarchy = ltl.multigrid(sphere)
+
+    @jax.jit
+    def energy(stretch):
+        moved = sphere.with_vertices(x * (1 + stretch * x[:, :1]))
+        return jnp.sum(ltl.screened_poisson(moved, f, preconditioner=hierarchy) ** 2)
+
+    slope = (energy(0.1 + 1e-4) - energy(0.1 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.grad(energy)(0.1), slope, rtol=1e-6)
+
+
+def test_heat_with_a_source_reaches_its_stationary_state_both_ways():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
+    x1 = surface.vertices[:, 0]
+    equation = ltl.Diffusion(source=x1)
+    marched = ltl.solve(equation, surface, 0 * x1, 15.0, rtol=1e-8, atol=1e-10).us[-1]
+    solved = ltl.steady_state(equation, surface, 0 * x1)
+    np.testing.assert_allclose(solved, x1 / 2, atol=1e-4)
+    np.testing.assert_allclose(marched, solved, atol=1e-6)
+    # The mass of where it starts is kept.
+    np.testing.assert_allclose(ltl.steady_state(equation, surface, 0 * x1 + 3), solved + 3, atol=1e-8)
+
+
+def poloidal(mesh):
+    x, y, z = mesh.vertices.T
+    return np.arctan2(z, np.hypot(x, y) - 2)
+
+
+def test_the_torus_with_source_sin_x_has_its_closed_form():
+    errors = []
+    for n in (24, 48):
+        mesh = ltl.shapes.torus(2.0, 1.0, 2 * n, n)
+        surface, x = ltl.Surface.from_mesh(mesh), poloidal(mesh)
+        exact = np.sin(x) / 2 + (x - 2 * np.arctan(np.sqrt(1 / 3) * np.tan(x / 2)))
+        assert abs(np.abs(exact).max() - 1.0330186828) < 0.01
+        found = ltl.steady_state(ltl.Diffusion(source=jnp.sin(jnp.asarray(x))), surface, jnp.zeros(mesh.num_vertices))
+        errors.append(float(jnp.linalg.norm(found - exact) / np.linalg.norm(exact)))
+    assert np.log2(errors[0] / errors[1]) > 1.8
+    assert errors[1] < 2e-3
+
+
+def test_the_torus_with_the_published_source_has_its_profile_and_without_its_mean_taken_off_none():
+    mesh = ltl.shapes.torus(2.0, 1.0, 128, 64)
+    surface = ltl.Surface.from_mesh(mesh)
+    angle = jnp.asarray(np.mod(poloidal(mesh), 2 * np.pi))
+    # At the jump the mean of both sides, as the integral has it.
+    angle = jnp.where(angle == 0, jnp.pi, angle)
+    found = ltl.steady_state(ltl.Diffusion(source=angle - jnp.pi), surface, jnp.zeros(mesh.num_vertices))
+    assert abs(found.max() - 2.1257) < 5e-3
+    assert abs(found.min() + 2.1257) < 5e-3
+    quarter = found[jnp.argmin(jnp.abs(angle - jnp.pi / 2))]
+    assert abs(quarter + 2.119092) < 5e-3
+    with pytest.raises(ltl.SolveError, match="no stationary state"):
+        ltl.steady_state(ltl.Diffusion(source=angle), surface, jnp.zeros(mesh.num_vertices))
+
+
+def test_a_pattern_is_found_as_a_stationary_state_and_differentiated():
+    surface = ltl.Surface.from_mesh(ltl.shapes.torus(n_major=24, n_minor=12))
+
+    def schnakenberg(species, p):
+        u, v = species
+        return p * (0.1 - u + u**2 * v), p * (0.9 - u**2 * v)
+
+    random = np.random.default_rng(0)
+    start = jnp.asarray(np.array([1.0, 0.9]) + 0.1 * random.normal(size=(surface.num_vertices, 2)) * np.array([1, 0]))
+
+    def equation(rate):
+        return ltl.ReactionDiffusion((1.0, 40.0), schnakenberg, params=rate)
+
+    rate = jnp.array(4.0)
+    found = ltl.steady_state(equation(rate), surface, start)
+    assert jnp.ptp(found[:, 0]) > 0.5
+    residual = equation(rate).rate(jnp.zeros(()), surface, found)
+    assert jnp.sqrt(jnp.mean(residual**2)) < 1e-8
+
+    def mean_square(rate):
+        return jnp.mean(ltl.steady_state(equation(rate), surface, found, throw=False)[:, 0] ** 2)
+
+    step = 1e-4
+    slope = (mean_square(rate + step) - mean_square(rate - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(mean_square)(rate), slope, rtol=1e-4)
+
+
+def test_eigenvalues_of_the_sphere_and_of_the_disk():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
+    modes = ltl.eigenmodes(surface, 9)
+    values, vectors = modes
+    np.testing.assert_allclose(values, [0, 2, 2, 2, 6, 6, 6, 6, 6], rtol=5e-3, atol=1e-8)
+    assert modes.residuals.max() < 1e-3
+    np.testing.assert_allclose(ltl.integrate(surface, vectors**2), 1, rtol=1e-8)
+    np.testing.assert_allclose(modes.left.T @ vectors, np.eye(9), atol=1e-8)
+    disk = ltl.Surface.from_mesh(ltl.shapes.disk())
+    held = ltl.eigenmodes(disk, 3, ltl.Dirichlet()).values
+    expected = [jn_zeros(0, 1)[0] ** 2, jn_zeros(1, 1)[0] ** 2, jn_zeros(1, 1)[0] ** 2]
+    np.testing.assert_allclose(held, expected, rtol=1e-2)
+
+
+def test_the_derivative_of_an_eigenvalue_in_the_shape_agrees_with_differences():
+    mesh = ltl.shapes.ellipsoid(1.0, 1.3, 1.7, subdivisions=3)
+    surface = ltl.Surface.from_mesh(mesh)
+    x = surface.vertices
+
+    def moved(stretch):
+        return surface.with_vertices(x * (1 + stretch * x[:, :1] ** 2))
+
+    modes = ltl.eigenmodes(surface, 4)
+    slopes = jax.jacfwd(lambda s: modes.values_on(moved(s)))(0.0)
+    step = 1e-4
+    up, down = (ltl.eigenmodes(moved(sign * step), 4).values for sign in (1, -1))
+    np.testing.assert_allclose(slopes[1:], (up - down)[1:] / (2 * step), rtol=1e-4)
+
+
+@pytest.mark.parametrize("make", [ltl.shapes.icosphere, lambda n: ltl.shapes.jittered_sphere(n, 0.4, seed=0)])
+def test_geodesic_distance_converges_on_the_sphere(make):
+    errors = []
+    for level in (3, 4):
+        surface = ltl.Surface.from_mesh(make(level))
+        exact = jnp.arccos(jnp.clip(surface.vertices @ surface.vertices[0], -1, 1))
+        errors.append(jnp.max(jnp.abs(ltl.geodesic_distance(surface, 0) - exact)))
+    assert errors[1] < 0.05
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_distance_from_several_sources_is_that_from_the_nearest():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
+    poles = [int(jnp.argmax(surface.vertices[:, 2])), int(jnp.argmin(surface.vertices[:, 2]))]
+    exact = jnp.arccos(jnp.clip(jnp.abs(surface.vertices[:, 2]), 0, 1))
+    assert jnp.max(jnp.abs(ltl.geodesic_distance(surface, poles) - exact)) < 0.06
+    with pytest.raises(ValueError, match="source vertices from 0"):
+        ltl.geodesic_distance(surface, [10**6])
+
+
+def test_what_is_not_solvable_is_said(sphere):
+    with pytest.raises(ValueError, match="positive screening, found 0"):
+        ltl.screened_poisson(sphere, sphere.vertices[:, 0], 0.0)
+    with pytest.raises(ValueError, match=r"found \(7,\)"):
+        ltl.poisson(sphere, jnp.zeros(7))
+    with pytest.raises(ValueError, match="number of modes"):
+        ltl.eigenmodes(sphere, 10**6)
+    oscillating = ltl.ReactionDiffusion((0.1, 0.1), lambda s, p: (s[1] - p * s[0] ** 3, p - s[0] - 2.0), params=1.0)
+    start = jnp.ones((sphere.num_vertices, 2))
+    with pytest.raises(ValueError, match='"newton" or "marching"'):
+        ltl.steady_state(oscillating, sphere, start, "guess")

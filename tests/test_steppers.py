@@ -1,0 +1,280 @@
+"""Steppers: order in time, stability, the maximum principle, and derivatives through all of them."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ltljax as ltl
+
+# Solver, order, and the fewest and most fixed steps of the interval.
+SOLVERS = {
+    "BackwardEuler": (ltl.BackwardEuler(), 1, (8, 32)),
+    "CrankNicolson": (ltl.CrankNicolson(), 2, (8, 32)),
+    "TRBDF2": (ltl.TRBDF2(), 2, (8, 32)),
+    "SBDF2": (ltl.SBDF2(), 2, (16, 64)),
+    "Kvaerno3": (diffrax.Kvaerno3(), 3, (16, 64)),
+    "Kvaerno5": (diffrax.Kvaerno5(), 5, (8, 32)),
+    "KenCarp3": (diffrax.KenCarp3(), 3, (16, 64)),
+    "KenCarp4": (diffrax.KenCarp4(), 4, (8, 32)),
+    "KenCarp5": (diffrax.KenCarp5(), 5, (8, 32)),
+    "Sil3": (diffrax.Sil3(), 2, (8, 32)),
+    "RKC2": (ltl.RKC2(), 2, (16, 64)),
+    "RKL1": (ltl.RKL1(), 1, (16, 64)),
+}
+FULLY_IMPLICIT = ["BackwardEuler", "CrankNicolson", "TRBDF2", "Kvaerno3", "Kvaerno5"]
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+
+
+@pytest.fixture(scope="module")
+def decay(sphere):
+    """A diffusion's start and its state at t = 0.4, by the matrix exponential; few modes, so that orders show."""
+    values, vectors = np.linalg.eig(ltl.laplacian_matrix(sphere).todense())
+    x = np.asarray(sphere.vertices)
+    few = np.argsort(-values.real)[:16]
+    start = (vectors[:, few] @ np.linalg.pinv(vectors[:, few]) @ (3 * x.prod(axis=1) + x[:, 0])).real
+    return start, (vectors @ (np.exp(0.4 * values) * np.linalg.solve(vectors, start))).real
+
+
+def slopes(errors, counts):
+    return -np.diff(np.log(errors)) / np.diff(np.log(counts))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_fixed_steps_have_the_order_of_the_method(sphere, decay, name):
+    solver, order, counts = SOLVERS[name]
+    start, exact = decay
+    errors = []
+    for count in counts:
+        found = ltl.solve(ltl.Diffusion(), sphere, start, 0.4, solver=solver, dt=0.4 / count, rtol=1e-12, atol=1e-13)
+        errors.append(float(jnp.linalg.norm(found.us[-1] - exact) / np.linalg.norm(exact)))
+    assert abs(slopes(errors, counts)[0] - order) < 0.2
+    assert errors[-1] < 0.1**order
+
+
+@pytest.mark.parametrize("name", ["TRBDF2", "SBDF2", "KenCarp3", "Kvaerno3", "RKC2", "CrankNicolson"])
+def test_the_order_holds_with_a_source_in_time_and_a_reaction(sphere, name):
+    solver, order, counts = SOLVERS[name]
+    x = sphere.vertices
+
+    def oscillator(species, params):
+        u, v = species
+        return -2.0 * v - u**3, 2.0 * u - params * v
+
+    equation = ltl.ReactionDiffusion((0.05, 0.02), oscillator, params=jnp.array(0.3))
+    u0 = jnp.stack([1 + x[:, 0], x[:, 1]], axis=1)
+    run = lambda solver, **how: ltl.solve(equation, sphere, u0, 1.0, solver=solver, **how).us[-1]  # noqa: E731
+    exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
+    counts = (16, 64) if order == 2 else (8, 32)
+    errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
+    assert abs(slopes(errors, counts)[0] - order) < 0.25
+    source = ltl.Diffusion(0.05, source=lambda t, x: jnp.cos(5 * t) * x[:, 0])
+    run = lambda solver, **how: ltl.solve(source, sphere, 0 * x[:, 0], 1.0, solver=solver, **how).us[-1]  # noqa: E731
+    exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
+    errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
+    assert abs(slopes(errors, counts)[0] - order) < 0.25
+
+
+@pytest.mark.parametrize("name", ["BackwardEuler", "TRBDF2", "Kvaerno3", "SBDF2", "KenCarp3"])
+def test_l_stable_solvers_forget_what_is_stiff(sphere, name):
+    rough = jnp.asarray(np.random.default_rng(0).normal(size=sphere.num_vertices))
+    stiff = ltl.Diffusion(1e5)
+    mean = ltl.integrate(sphere, rough, sphere.mass) / jnp.sum(sphere.mass)
+    end = ltl.solve(stiff, sphere, rough, 1.0, solver=SOLVERS[name][0], dt=0.1, rtol=1e-10, atol=1e-12).us[-1]
+    assert jnp.max(jnp.abs(end - mean)) < 1e-6
+    # And Crank-Nicolson does not.
+    end = ltl.solve(stiff, sphere, rough, 1.0, solver=ltl.CrankNicolson(), dt=0.1, rtol=1e-10, atol=1e-12).us[-1]
+    assert jnp.max(jnp.abs(end - mean)) > 0.1
+
+
+@pytest.mark.parametrize("solver", [ltl.RKL1(), ltl.BackwardEuler()], ids=["RKL1", "BackwardEuler"])
+@pytest.mark.parametrize("stiffness", [3.0, 100.0, 3000.0])
+def test_first_order_members_keep_the_maximum_principle(solver, stiffness):
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(300, seed=1))
+    dt = stiffness / float(ltl.operators.spectral_bound(surface))
+    random = np.random.default_rng(0)
+    spikes = jnp.asarray((random.random((surface.num_vertices, 8)) > 0.97) * 1.0)
+    u = ltl.solve(ltl.Diffusion(jnp.ones(8)), surface, spikes, 5 * dt, solver=solver, dt=dt, rtol=1e-12, atol=1e-13).us
+    assert u.min() > -1e-10
+    assert u.max() < 1 + 1e-10
+
+
+@pytest.mark.parametrize("solver", [ltl.RKC2(), ltl.RKL1()], ids=["RKC2", "RKL1"])
+def test_stages_grow_with_the_square_root_of_the_stiffness(sphere, solver):
+    start = sphere.vertices[:, 0]
+    counts = []
+    for diffusivity in (10.0, 1000.0):
+        found = ltl.solve(ltl.Diffusion(diffusivity), sphere, start, 0.1, solver=solver, dt=0.1)
+        counts.append(int(found.stats["num_evaluations"]))
+    assert 8 < counts[1] / counts[0] < 13
+
+
+def test_a_fixed_step_beyond_all_stages_stops_the_run(sphere):
+    with pytest.raises(ltl.SolveError, match="overflowed"):
+        ltl.solve(ltl.Diffusion(1e5), sphere, sphere.vertices[:, 0], 1.0, solver=ltl.RKC2(), dt=1.0)
+
+
+@pytest.mark.parametrize("name", ["TRBDF2", "KenCarp3", "Kvaerno5"])
+def test_adaptive_implicit_steps_follow_the_tolerance(sphere, decay, name):
+    start, exact = decay
+    errors = []
+    for tolerance in (1e-4, 1e-7):
+        found = ltl.solve(ltl.Diffusion(), sphere, start, 0.4, solver=SOLVERS[name][0], rtol=tolerance, atol=tolerance)
+        errors.append(float(jnp.linalg.norm(found.us[-1] - exact) / np.linalg.norm(exact)))
+    assert errors[0] < 1e-2
+    assert errors[1] < 0.03 * errors[0]
+
+
+GRADIENTS = {
+    "explicit": (diffrax.Heun(), dict(dt=0.01)),
+    "RKC2": (ltl.RKC2(), dict(dt=0.1)),
+    "SBDF2": (ltl.SBDF2(), dict(dt=0.1)),
+    "KenCarp3": (diffrax.KenCarp3(), dict(dt=0.2)),
+    "TRBDF2": (ltl.TRBDF2(), dict(dt=0.2)),
+}
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name):
+    solver, how = GRADIENTS[name]
+    x = sphere.vertices
+    hierarchy = ltl.multigrid(sphere)
+    u0 = jnp.stack([1 - 0.5 * jnp.exp(-4 * x[:, 0] ** 2), 0.5 * jnp.exp(-4 * x[:, 1] ** 2)], axis=1)
+
+    def loss(parameters):
+        kinetics = ltl.kinetics.gray_scott(parameters["feed"], 0.06)
+        equation = ltl.ReactionDiffusion((parameters["diffusivity"], 0.01), kinetics)
+        moved = sphere.with_vertices(x * (1 + parameters["shape"] * x[:, :1]))
+        start = u0 * (1 + parameters["start"][:, None])
+        how_exactly = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
+        end = ltl.solve(equation, moved, start, 1.0, solver=solver, **how_exactly).us[-1]
+        return jnp.sum(end**2 * x[:, :2])
+
+    random = np.random.default_rng(0)
+    at = dict(
+        diffusivity=jnp.array(0.1), feed=jnp.array(0.04), shape=jnp.array(0.1),
+        start=jnp.asarray(0.1 * random.normal(size=sphere.num_vertices)),
+    )  # fmt: skip
+    value, gradient = jax.jit(jax.value_and_grad(loss))(at)
+    loss = jax.jit(loss)
+    directions = dict(
+        diffusivity=0.1, feed=0.03, shape=0.1, start=0.2 * random.normal(size=sphere.num_vertices)
+    )  # fmt: skip
+    for key, direction in directions.items():
+        slope = jnp.sum(gradient[key] * direction)
+        rest = [abs(loss({**at, key: at[key] + h * direction}) - value - h * slope) for h in (0.1, 0.01)]
+        assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
+
+
+def test_a_source_field_is_differentiated_in_forward_and_reverse(sphere):
+    x1 = sphere.vertices[:, 0]
+
+    def end(source, adjoint=None):
+        equation = ltl.Diffusion(0.5, source=source)
+        solution = ltl.solve(equation, sphere, 0 * x1, 1.0, solver=ltl.TRBDF2(), dt=0.25, adjoint=adjoint, rtol=1e-10)
+        return jnp.sum(solution.us[-1] * jnp.cos(3 * x1))
+
+    reverse = jax.grad(end)(x1)
+    _, forward = jax.jvp(lambda source: end(source, diffrax.ForwardMode()), (x1,), (x1**2,))
+    np.testing.assert_allclose(jnp.sum(reverse * x1**2), forward, rtol=1e-8)
+    # Linear in the source, so the difference is exact.
+    np.testing.assert_allclose(end(x1 + x1**2) - end(x1), forward, rtol=1e-7)
+
+
+def test_ensembles_are_vmapped_through_implicit_steps(sphere):
+    x = sphere.vertices
+    run = lambda d, u: ltl.solve(  # noqa: E731
+        ltl.Diffusion(d), sphere, u, 0.5, solver=ltl.TRBDF2(), dt=0.1, rtol=1e-10, throw=False
+    ).us[-1]
+    rates, starts = jnp.array([0.5, 1.0, 2.0]), jnp.stack([x[:, 0], x[:, 1], x[:, 2] ** 2])
+    many = jax.vmap(run)(rates, starts)
+    for d, u, found in zip(rates, starts, many, strict=True):
+        np.testing.assert_allclose(found, run(d, u), atol=1e-9)
+
+
+def test_jacobi_serves_where_multigrid_does_not(sphere, monkeypatch):
+    with_multigrid = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
+    monkeypatch.setattr("ltljax.solve.evolve.is_available", lambda: False)
+    without = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
+    assert "multigrid" in with_multigrid.stats["solver"]
+    assert "Jacobi" in without.stats["solver"]
+    np.testing.assert_allclose(without.us, with_multigrid.us, atol=1e-5)
+
+
+def test_implicit_steps_hold_boundary_values():
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk(12))
+    x = surface.vertices
+    equation = ltl.Diffusion(source=0 * x[:, 0], boundary=ltl.Dirichlet(lambda t, x: 1 + t + 0 * x[:, 0]))
+    explicit = ltl.solve(equation, surface, jnp.ones(surface.num_vertices), 1.0, rtol=1e-8, atol=1e-10).us[-1]
+    for solver in (ltl.TRBDF2(), diffrax.KenCarp4()):
+        implicit = ltl.solve(
+            equation, surface, jnp.ones(surface.num_vertices), 1.0, solver=solver, rtol=1e-7, atol=1e-9
+        ).us[-1]
+        np.testing.assert_allclose(implicit, explicit, atol=1e-5)
+        assert implicit[surface.topology.boundary].min() == 2.0
+
+
+def test_a_run_stops_when_told_and_says_so(sphere):
+    x1 = sphere.vertices[:, 0]
+    source = ltl.Diffusion(source=x1)
+    found = ltl.solve(source, sphere, 0 * x1, 1e3, stop_when=ltl.Steady(1e-5))
+    assert bool(found.stopped)
+    assert 2 < found.t_end < 20
+    np.testing.assert_allclose(found.u_end, x1 / 2, atol=1e-2)
+    never = ltl.solve(source, sphere, 0 * x1, 0.1, stop_when=lambda t, u, rate: jnp.max(u) > 10)
+    assert not bool(never.stopped)
+
+
+def test_a_dense_solution_is_known_at_every_time(sphere):
+    x1 = sphere.vertices[:, 0]
+    found = ltl.solve(ltl.Diffusion(), sphere, x1, 1.0, dense=True, max_steps=500, rtol=1e-7, atol=1e-9)
+    for t in (0.1, 0.37, 0.9):
+        np.testing.assert_allclose(found.at(t), jnp.exp(-2 * t) * x1, atol=2e-2)
+    with pytest.raises(ValueError, match="dense=True"):
+        ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
+
+
+WRONG = {
+    "negative diffusivity": (dict(equation=ltl.Diffusion(-1.0)), "not negative, found -1"),
+    "an equation that is not finite": (dict(equation=ltl.Diffusion(float("inf"))), "diffusivity is not finite"),
+    "a state of another length": (dict(u0=jnp.ones(5)), r"found \(5,\)"),
+    "a source of another shape": (dict(equation=ltl.Diffusion(source=jnp.ones(5))), r"found \(5,\)"),
+    "times out of order": (dict(ts=[0.5, 0.2]), r"ts\[1\] = 0.2 after 0.5"),
+    "times beyond the end": (dict(ts=[0.5, 2.0]), r"found ts\[1\] = 2.0"),
+    "an end before the start": (dict(t0=3.0), "t0 = 3.0 and t1 = 1.0"),
+    "a step that is not positive": (dict(dt=0.0), "dt = 0.0"),
+    "an explicit step too long": (dict(dt=0.5, solver=diffrax.Tsit5()), "too long for Tsit5"),
+    "SBDF2 without steps": (dict(solver=ltl.SBDF2()), "SBDF2 takes fixed steps"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_each_mistake_is_one_clear_error(sphere, case):
+    given, message = WRONG[case]
+    call = dict(equation=ltl.Diffusion(), surface=sphere, u0=sphere.vertices[:, 0], t1=1.0) | given
+    with pytest.raises(ValueError, match=message):
+        ltl.solve(**call)
+
+
+def test_the_longest_stable_step_is_that_of_the_stiffest_mode(sphere):
+    from ltljax.solve.checks import real_stability
+
+    values = np.linalg.eigvals(ltl.laplacian_matrix(sphere).todense())
+    longest = real_stability(diffrax.Heun()) / np.abs(values).max()
+    rough = jnp.asarray(np.random.default_rng(0).normal(size=sphere.num_vertices))
+    ltl.solve(ltl.Diffusion(), sphere, rough, 300 * longest, solver=diffrax.Heun(), dt=0.98 * longest)
+    with pytest.raises(ValueError, match="too long for Heun"):
+        ltl.solve(ltl.Diffusion(), sphere, rough, 300 * longest, solver=diffrax.Heun(), dt=1.1 * longest)
+
+
+@pytest.mark.parametrize("name", FULLY_IMPLICIT)
+def test_newton_solves_a_stiff_reaction(sphere, name):
+    relax = ltl.ReactionDiffusion((0.1,), lambda species, k: (-k * (species[0] ** 3 - 1),), params=jnp.array(1e4))
+    u0 = 1 + 0.5 * sphere.vertices[:, :1]
+    end = ltl.solve(relax, sphere, u0, 1.0, solver=SOLVERS[name][0]).us[-1]
+    np.testing.assert_allclose(end, 1, atol=1e-3)
