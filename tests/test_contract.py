@@ -165,3 +165,21 @@ def test_a_surface_says_what_it_is_built_from():
         with pytest.raises(ValueError, match="jax_enable_x64"):
             ltl.Surface.from_mesh(mesh, dtype=jnp.float64)
         assert ltl.Surface.from_mesh(mesh).dtype == jnp.float32
+
+
+@pytest.mark.parametrize("scheme", [ltl.Paper(), ltl.Monotone(), ltl.Polynomial(degree=4)], ids=str)
+def test_weights_of_positions_computed_in_the_same_jit_are_those_of_positions_at_hand(scheme):
+    # XLA computes such positions anew for each use, and differences that are zero in exact arithmetic are not then.
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3), scheme)
+
+    def moved(surface):
+        return surface.vertices * (1 + 0.1 * surface.vertices[:, :1])
+
+    inside = jax.jit(lambda surface: surface.with_vertices(moved(surface)).geometry)(surface)
+    outside = surface.with_vertices(moved(surface)).geometry
+    for (path, found), expected in zip(
+        jax.tree_util.tree_leaves_with_path(inside), jax.tree.leaves(outside), strict=True
+    ):
+        if found.size and "residual" not in jax.tree_util.keystr(path):
+            scale = np.abs(expected).max()
+            np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9, err_msg=jax.tree_util.keystr(path))

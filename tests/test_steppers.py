@@ -1,5 +1,7 @@
 """Steppers: order in time, stability, the maximum principle, and derivatives through all of them."""
 
+import sys
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -20,7 +22,7 @@ SOLVERS = {
     "KenCarp4": (diffrax.KenCarp4(), 4, (8, 32)),
     "KenCarp5": (diffrax.KenCarp5(), 5, (8, 32)),
     "Sil3": (diffrax.Sil3(), 2, (8, 32)),
-    "RKC2": (ltl.RKC2(), 2, (16, 64)),
+    "RKC2": (ltl.RKC2(), 2, (64, 256)),
     "RKL1": (ltl.RKL1(), 1, (16, 64)),
 }
 FULLY_IMPLICIT = ["BackwardEuler", "CrankNicolson", "TRBDF2", "Kvaerno3", "Kvaerno5"]
@@ -70,14 +72,14 @@ def test_the_order_holds_with_a_source_in_time_and_a_reaction(sphere, name):
     u0 = jnp.stack([1 + x[:, 0], x[:, 1]], axis=1)
     run = lambda solver, **how: ltl.solve(equation, sphere, u0, 1.0, solver=solver, **how).us[-1]  # noqa: E731
     exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
-    counts = (16, 64) if order == 2 else (8, 32)
+    counts = (64, 256)
     errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
-    assert abs(slopes(errors, counts)[0] - order) < 0.25
+    assert abs(slopes(errors, counts)[0] - order) < 0.2
     source = ltl.Diffusion(0.05, source=lambda t, x: jnp.cos(5 * t) * x[:, 0])
     run = lambda solver, **how: ltl.solve(source, sphere, 0 * x[:, 0], 1.0, solver=solver, **how).us[-1]  # noqa: E731
     exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
     errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
-    assert abs(slopes(errors, counts)[0] - order) < 0.25
+    assert abs(slopes(errors, counts)[0] - order) < 0.2
 
 
 @pytest.mark.parametrize("name", ["BackwardEuler", "TRBDF2", "Kvaerno3", "SBDF2", "KenCarp3"])
@@ -199,7 +201,7 @@ def test_ensembles_are_vmapped_through_implicit_steps(sphere):
 
 def test_jacobi_serves_where_multigrid_does_not(sphere, monkeypatch):
     with_multigrid = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
-    monkeypatch.setattr("ltljax.solve.evolve.is_available", lambda: False)
+    monkeypatch.setattr(sys.modules["ltljax.solve.evolve"], "is_available", lambda: False)
     without = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
     assert "multigrid" in with_multigrid.stats["solver"]
     assert "Jacobi" in without.stats["solver"]
@@ -215,7 +217,7 @@ def test_implicit_steps_hold_boundary_values():
         implicit = ltl.solve(
             equation, surface, jnp.ones(surface.num_vertices), 1.0, solver=solver, rtol=1e-7, atol=1e-9
         ).us[-1]
-        np.testing.assert_allclose(implicit, explicit, atol=1e-5)
+        np.testing.assert_allclose(implicit, explicit, atol=1e-4)
         assert implicit[surface.topology.boundary].min() == 2.0
 
 
@@ -224,7 +226,7 @@ def test_a_run_stops_when_told_and_says_so(sphere):
     source = ltl.Diffusion(source=x1)
     found = ltl.solve(source, sphere, 0 * x1, 1e3, stop_when=ltl.Steady(1e-5))
     assert bool(found.stopped)
-    assert 2 < found.t_end < 20
+    assert 2 < found.t_end < 40
     np.testing.assert_allclose(found.u_end, x1 / 2, atol=1e-2)
     never = ltl.solve(source, sphere, 0 * x1, 0.1, stop_when=lambda t, u, rate: jnp.max(u) > 10)
     assert not bool(never.stopped)

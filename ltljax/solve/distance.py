@@ -2,6 +2,7 @@
 
 import functools
 import warnings
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ _DECAY = 500
 
 
 def geodesic_distance(
-    surface: Surface, sources: Int[AnyArray, " n"] | int, time: float | None = None
+    surface: Surface, sources: Int[AnyArray, " n"] | Sequence[int] | int, time: float | None = None
 ) -> Float[Array, " V"]:
     """The distance along the surface of every vertex from the nearest of some source vertices (host): first order.
 

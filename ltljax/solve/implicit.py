@@ -37,6 +37,9 @@ class _Newton(optx.Newton):
     optimistix's own test, without its look at the residual, takes whatever has not converged in two steps for diverged.
     """
 
+    rtol: Array | float  # type: ignore
+    atol: Array | float  # type: ignore
+
     def terminate(self, fn, y, args, options, state, tags):
         """Whether the corrections are small enough, or the linear systems could not be solved."""
         del fn, y, args, options, tags

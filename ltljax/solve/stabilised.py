@@ -169,7 +169,8 @@ def _row(s: int) -> dict[str, np.ndarray]:
     w1 = dT[s] / ddT[s]
     b = np.zeros(s + 1)
     b[2:] = ddT[2:] / dT[2:] ** 2
-    b[0], b[1] = b[2], 1 / w0
+    # As the code of the source has it: then the first stage stands where its time says, c[1] = mu_rate[1].
+    b[:2] = b[2]
     a = 1 - b * T
     size = int(_STAGES[-1]) + 1
     mu, nu, mu_rate, gamma_rate, c = (np.zeros(size) for _ in range(5))

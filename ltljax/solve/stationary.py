@@ -323,7 +323,8 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
         adjoint=optx.ImplicitAdjoint(exact),
         throw=False,
     )
-    # Where Newton's last steps did not help, what the march found stands.
+    # Where Newton's last steps did not help, what the march found stands; the derivative is that of the root.
     is_better = rms(rate(found.value)) <= rms(rate(u))
-    u = jnp.where(is_better, found.value, u)
-    return u, rms(rate(u)), steps
+    best = jax.lax.stop_gradient(jnp.where(is_better, found.value, u))
+    best = best + (found.value - jax.lax.stop_gradient(found.value))
+    return best, rms(rate(best)), steps
