@@ -73,6 +73,9 @@ def _parser() -> argparse.ArgumentParser:
         "--keep-scale", action="store_true", help="mesh files: do not scale the area to the unit sphere's"
     )
     run_.add_argument("--repair", action="store_true", help="mesh files: mend what can be mended")
+    run_.add_argument(
+        "--resume", action="store_true", help="go on with a run that was interrupted: the same command, the same --out"
+    )
 
     listing = commands.add_parser("list", help="the scenarios and built-in meshes")
     listing.set_defaults(command=_list)
@@ -142,5 +145,8 @@ def _run(options: argparse.Namespace) -> int:
         t1=options.t1,
     )
     example = scenario.SCENARIOS[options.scenario](chosen)
-    run(example, chosen, scheme=_scheme(options), dtype=options.dtype, frames=options.frames, out=options.out)
+    run(
+        example, chosen, scheme=_scheme(options), dtype=options.dtype, frames=options.frames, out=options.out,
+        resume=options.resume,
+    )  # fmt: skip
     return 0

@@ -24,6 +24,7 @@ from .operators import integrate
 from .progress import watched
 from .scenario import Options, Scenario
 from .solve import GrowingModesWarning, SolveError, solve
+from .solve.restart import Keeper, fingerprint
 from .surface import Surface
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
@@ -43,8 +44,12 @@ class _Progress:
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
-def run(example: Scenario, options: Options, *, scheme: Scheme, dtype: str, frames: int, out: Path) -> dict[str, Any]:
+def run(
+    example: Scenario, options: Options, *, scheme: Scheme, dtype: str, frames: int, out: Path, resume: bool = False
+) -> dict[str, Any]:
     """Solve a scenario and write its results.
+
+    While it runs, every state is put on disk in ``out/restart``, so that a run that is killed can be taken up again.
 
     Args:
         example: the scenario.
@@ -53,12 +58,14 @@ def run(example: Scenario, options: Options, *, scheme: Scheme, dtype: str, fram
         dtype: ``"float32"`` or ``"float64"``.
         frames: how many states to keep, evenly spaced in time, besides the first.
         out: the folder to write to; made if absent.
+        resume: whether to go on from what ``out/restart`` holds of the same run.
 
     Returns:
         What ``summary.json`` holds.
 
     Raises:
         SolveError: the run could not be carried to its end. What it had reached is written all the same.
+        RestartError: ``out/restart`` holds the states of another run, or they are damaged.
     """
     out.mkdir(parents=True, exist_ok=True)
     mesh = example.mesh
@@ -71,9 +78,16 @@ def run(example: Scenario, options: Options, *, scheme: Scheme, dtype: str, fram
     _print_notes((*example.notes, *cautions))
 
     reached = _Progress([0.0], [example.u0])
+    times = np.linspace(0, example.t1, frames + 1)
+    same = dict(
+        mesh=fingerprint((mesh.vertices, mesh.faces)),
+        scenario=fingerprint((example.name, example.parameters, example.u0, dataclasses.asdict(options))),
+        numbers=fingerprint((times, repr(scheme), dtype)),
+    )
+    keeper = Keeper(out / "restart", same, resume)
     failure = None
     try:
-        _advance(example, surface, np.linspace(0, example.t1, frames + 1), reached)
+        _advance(example, surface, times, reached, keeper)
     except SolveError as error:
         failure = error
     measured = _measure(example, surface, reached)
@@ -102,15 +116,22 @@ def run(example: Scenario, options: Options, *, scheme: Scheme, dtype: str, fram
     )
     (out / "summary.json").write_text(json.dumps(summary, indent=2, default=_as_json) + "\n")
     print(f"{'written to':32} {out}: {', '.join([*files, 'summary.json'])}")
+    keeper.remove()
     if failure is not None:
         raise failure
     return summary
 
 
-def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _Progress) -> None:
+def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _Progress, keeper: Keeper) -> None:
     """Carry the state from each time to the next, so that it can be shown, kept, and stopped in between."""
     equation = example.make_equation(surface)
-    u = jnp.asarray(example.u0, surface.dtype)
+    for state, record in zip(keeper.states(), keeper.done, strict=True):
+        reached.times.append(record["t"])
+        reached.states.append(state)
+        reached.counts = record["counts"]
+    if keeper.done:
+        print(f"note: going on from t = {reached.times[-1]:g}")
+    u = jnp.asarray(reached.states[-1], surface.dtype)
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as cautions:
         warnings.simplefilter("always")
@@ -120,7 +141,7 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
     reached.compile_seconds = time.perf_counter() - start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GrowingModesWarning)  # said once
-        for t0, t1 in watched("time", unit="frame")(list(itertools.pairwise(times.tolist()))):
+        for t0, t1 in watched("time", unit="frame")(list(itertools.pairwise(times.tolist()))[len(keeper.done) :]):
             start = time.perf_counter()
             solution = solve(equation, surface, u, t1, t0=t0, throw=False, rtol=_RTOL, atol=_ATOL)
             u = jax.block_until_ready(solution.u_end)
@@ -130,6 +151,7 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
             reached.times.append(float(solution.t_end))
             reached.states.append(np.asarray(u))
             solution.check(surface)
+            keeper.keep(reached.states[-1], dict(t=reached.times[-1], counts=dict(reached.counts)))
 
 
 def _print_notes(notes: Iterable[str | warnings.WarningMessage]) -> None:

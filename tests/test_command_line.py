@@ -245,3 +245,33 @@ def test_the_published_scheme_overflows_on_spot(tmp_path, real_mesh, capsys, mon
     code, said = fails(capsys, "run", "turing", "--mesh", mesh, "--scheme", "paper", "--out", str(tmp_path))
     assert code == 1
     assert "overflowed at t = 0.0" in said
+
+
+def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, capsys, monkeypatch):
+    monkeypatch.setattr(pictures, "can_draw", lambda: False)
+    arguments = ["run", "turing", "--mesh", mesh_file(ltl.shapes.icosphere(2)), "--t1", "2", "--frames", "5"]
+    assert main([*arguments, "--out", str(tmp_path / "whole")]) == 0
+    calls = []
+
+    def interrupted(*given, **named):
+        calls.append(given)
+        if len(calls) == 4:  # one to compile, two frames
+            raise KeyboardInterrupt
+        return ltl.solve(*given, **named)
+
+    pieces = [*arguments, "--out", str(tmp_path / "pieces")]
+    with monkeypatch.context() as patched:
+        patched.setattr(sys.modules["ltljax.run"], "solve", interrupted)
+        assert main(pieces) == 130
+    assert (tmp_path / "pieces" / "restart" / "progress.json").exists()
+    capsys.readouterr()
+    code, error = fails(capsys, *pieces, "--resume", "--seed", "5")
+    assert code == 2
+    assert "another scenario" in error
+    assert main([*pieces, "--resume"]) == 0
+    assert "going on from t = 0.8" in capsys.readouterr().out
+    assert not (tmp_path / "pieces" / "restart").exists()
+    for name in ("turing.ply", "series/turing_0005.vtp"):
+        assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("pieces", "whole")]
+    assert summaries[0]["measured"]["steps"] == summaries[1]["measured"]["steps"]

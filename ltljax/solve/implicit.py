@@ -103,7 +103,7 @@ def implicit_stage(
     rate: Callable[[Array], Array],
     is_affine: bool,
     surface: Surface,
-    factor: Array,
+    factor: Any,
     right: Array,
     guess: Array,
     preconditioning: Preconditioning,
@@ -371,7 +371,7 @@ def _of_diffrax(solver: Any) -> Tableau:
     return Tableau(a, implicit.b_sol, implicit.b_error, c, (order, order), explicit)
 
 
-_OF_DIFFRAX = {
+_OF_DIFFRAX: dict[type, Tableau] = {
     solver: _of_diffrax(solver)
     for solver in (
         diffrax.Kvaerno3, diffrax.Kvaerno4, diffrax.Kvaerno5, diffrax.KenCarp3, diffrax.KenCarp4, diffrax.KenCarp5,

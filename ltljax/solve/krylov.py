@@ -127,7 +127,7 @@ class GMRES(lx.AbstractLinearSolver):
     max_steps: int = eqx.field(static=True, default=300)
 
     def _inner(self, dtype) -> lx.GMRES:
-        tolerance = jnp.asarray(self.tolerance, dtype)
+        tolerance: Any = jnp.asarray(self.tolerance, dtype)
         return lx.GMRES(0.0, tolerance, _rms, self.max_steps, self.restart, self.max_steps)
 
     def init(self, operator, options):

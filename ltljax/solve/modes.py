@@ -90,8 +90,10 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
     return Eigenmodes(cast(values), cast(spread[0]), cast(spread[1]), residuals)
 
 
-def _lowest(matrix: scipy.sparse.csc_array, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The k eigenvalues next to zero with right and left vectors, real, biorthonormal."""
+    values: Any
+    vectors: Any
     if matrix.shape[0] <= _DENSE:
         values, vectors = np.linalg.eig(matrix.toarray())
         order = np.lexsort((-values.imag, values.real))[:k]
@@ -107,12 +109,14 @@ def _lowest(matrix: scipy.sparse.csc_array, k: int, scale: float) -> tuple[np.nd
     count = min(k + 6, matrix.shape[0] - 2)
     found = []
     for side, transposed in (("N", matrix), ("T", matrix.T)):
-        inverse = scipy.sparse.linalg.LinearOperator(
+        operator: Any = scipy.sparse.linalg.LinearOperator
+        inverse = operator(
             matrix.shape, matvec=lambda v, side=side: factors.solve(np.ascontiguousarray(v).ravel(), trans=side),
             dtype=np.float64,
         )  # fmt: skip
         options: Any = dict(k=count, sigma=shift, OPinv=inverse, v0=start, ncv=max(2 * count + 1, 20))
-        values, vectors = scipy.sparse.linalg.eigs(scipy.sparse.csc_array(transposed), **options)
+        pairs: Any = scipy.sparse.linalg.eigs(scipy.sparse.csc_array(transposed), **options)
+        values, vectors = pairs
         order = np.lexsort((-values.imag, values.real))[:k]
         found.append((values[order], vectors[:, order]))
     (values, right), (_, left) = found
@@ -120,7 +124,7 @@ def _lowest(matrix: scipy.sparse.csc_array, k: int, scale: float) -> tuple[np.nd
     return values.real, right, left
 
 
-def _real(values: np.ndarray, right: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _real(values: Any, right: Any, left: Any) -> tuple[np.ndarray, np.ndarray]:
     """Real vectors of the same spaces: of a pair that is complex by discretisation, its real and imaginary part."""
 
     def real(vectors):

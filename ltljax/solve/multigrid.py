@@ -232,9 +232,9 @@ def _set_up(surface: Surface, absorption: np.ndarray, is_held: np.ndarray) -> Mu
     down, levels, values, vectors = _hierarchy(scipy.sparse.csr_array(free @ conductances @ free), areas, lost)
     cast = lambda a: jnp.asarray(a, surface.dtype if a.dtype.kind == "f" else a.dtype)  # noqa: E731
     down, levels, values, vectors = jax.tree.map(cast, (down, levels, values, vectors))
-    absorption, is_free, measure = map(cast, (absorption, (~is_held).astype(np.float64), measure))
+    taken, is_free, measure = map(cast, (absorption, (~is_held).astype(np.float64), measure))
     reverse = surface.geometry.laplacian_reverse
-    return Multigrid(table, weights, reverse, absorption, is_free, measure, down, levels, values, vectors)
+    return Multigrid(table, weights, reverse, taken, is_free, measure, down, levels, values, vectors)
 
 
 def _cotangents(vertices: np.ndarray, faces: np.ndarray) -> scipy.sparse.csr_array:
@@ -254,7 +254,8 @@ def _cotangents(vertices: np.ndarray, faces: np.ndarray) -> scipy.sparse.csr_arr
 
 def _nearly_conserved(laplacian: scipy.sparse.csr_array, areas: np.ndarray) -> np.ndarray:
     """The areas after some sweeps of Jacobi for ``L^T m = 0``: what differs from the conserved measure is smooth."""
-    transposed, rates = scipy.sparse.csr_array(laplacian.T), -laplacian.diagonal()
+    transposed, rates = scipy.sparse.csr_array(laplacian.T), -np.asarray(laplacian.diagonal(), np.float64)
+    rates = np.where(rates > 0, rates, 1)
     for _ in range(_SWEEPS):
         areas = areas + 0.7 * (transposed @ areas) / rates
     return np.maximum(areas, 0)
@@ -268,7 +269,7 @@ def _hierarchy(conductances, masses: np.ndarray, absorption: np.ndarray) -> tupl
     # Vertices without neighbours would make empty rows.
     matrix = scipy.sparse.csr_matrix(matrix + 1e-3 * scipy.sparse.diags_array(masses) * (1 / masses.sum()))
     matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
-    solver = pyamg.ruge_stuben_solver(matrix, max_coarse=_COARSEST, keep=True, max_levels=20)
+    solver: Any = pyamg.ruge_stuben_solver(matrix, max_coarse=_COARSEST, keep=True, max_levels=20)
     if len(solver.levels) == 1:  # so few vertices that they are the coarsest level themselves
         every = np.arange(len(masses), dtype=np.int32)
         none = scipy.sparse.csr_array(matrix.shape)

@@ -111,7 +111,7 @@ class RKC2(_Stabilised):
 
     @staticmethod
     @functools.cache
-    def _coefficients():
+    def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
         rows = [_row(int(stages)) for stages in _STAGES]
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"stages": _STAGES}
 
@@ -144,7 +144,7 @@ class RKL1(_Stabilised):
 
     @staticmethod
     @functools.cache
-    def _coefficients():
+    def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
         s = _ODD_STAGES[:, None]
         j = np.maximum(np.arange(s[-1, 0] + 1), 1)[None]
         table = dict(mu=(2 * j - 1) / j, nu=(1 - j) / j, mu_rate=(2 * j - 1) / j * 2 / (s**2 + s))

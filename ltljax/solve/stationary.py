@@ -14,7 +14,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from ..equations import Diffusion, Equation
 from ..equations import boundary as bounds
@@ -185,7 +185,7 @@ def steady_state(
     u0: Float[AnyArray, "V *S"],
     method: Literal["newton", "marching"] = "newton",
     *,
-    t: ArrayLike = 0.0,
+    t: float = 0.0,
     tolerance: float = 1e-8,
     t1: float = 1e4,
     preconditioner: Multigrid | None = None,
@@ -312,11 +312,10 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
         return args(u)
 
     exact = GMRES(1e-10 if u.dtype == jnp.float64 else 1e-5, inverse(0.0))
+    goal: Any = jnp.asarray(tolerance, u.dtype)
     found = optx.root_find(
         residual,
-        optx.Newton(
-            jnp.asarray(tolerance, u.dtype), jnp.asarray(tolerance, u.dtype), optx.rms_norm, linear_solver=exact
-        ),
+        optx.Newton(goal, goal, optx.rms_norm, linear_solver=exact),
         u,
         eqx.filter_closure_convert(rate, u),
         max_steps=_MAX_NEWTON,

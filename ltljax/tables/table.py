@@ -165,7 +165,7 @@ def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
 
 def weighted_table(matrix: scipy.sparse.csr_array) -> tuple[Table, tuple[np.ndarray, ...]]:
     """The entries of a square sparse matrix off its diagonal, as a table and its weights (host)."""
-    entries = scipy.sparse.coo_array(matrix)
+    entries: Any = scipy.sparse.coo_array(matrix)
     is_off = (entries.row != entries.col) & (entries.data != 0)
     rows, columns, values = entries.row[is_off], entries.col[is_off], entries.data[is_off]
     order = np.argsort(rows, kind="stable")
