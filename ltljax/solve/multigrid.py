@@ -13,6 +13,7 @@ known inside jit.
 
 import importlib.util
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -40,13 +41,11 @@ from ..tables import (
 
 # A level of so many vertices is solved by its eigenvectors.
 _COARSEST = 400
-# Two sweeps of Jacobi before and after on the finest level, damped by the inverse Chebyshev nodes of [0.5, 2], the
-# upper three quarters of the range of a random walk's eigenvalues; one on the others, where two gain a sixth and cost
-# twice.
-_FINE_DAMPING = tuple(float(1 / (1.25 + 0.75 * np.cos(np.pi * angle))) for angle in (0.25, 0.75))
-_COARSE_DAMPING = 0.8
+# Two sweeps of Jacobi before and after, damped by the inverse Chebyshev nodes of [0.5, 2], the upper three quarters of
+# the range of a random walk's eigenvalues.
+_DAMPING = tuple(float(1 / (1.25 + 0.75 * np.cos(np.pi * angle))) for angle in (0.25, 0.75))
 # Sweeps of the transposed Laplacian from the vertex areas towards the measure it conserves.
-_SWEEPS = 20
+_SWEEPS = 50
 
 
 class Interpolation(eqx.Module):
@@ -154,15 +153,13 @@ class Multigrid(eqx.Module):
         free = self.is_free[:, None]
         diagonal = free * (alpha[None] + beta[None] * own[:, None]) + (1 - free)
         weights = free * self.measure[:, None]
-        u = _FINE_DAMPING[0] * r / diagonal
-        u = u + _FINE_DAMPING[1] * (r - apply(u)) / diagonal
+        u = _DAMPING[0] * r / diagonal
+        u = u + _DAMPING[1] * (r - apply(u)) / diagonal
         residual = r - apply(u)
         below = self.down.restrict(residual if transposed else weights * residual)
         below = self.down.prolong(self._cycle(0, alpha, beta, below))
         u = u + (weights if transposed else free) * below
-        dampings = jnp.asarray(_FINE_DAMPING[::-1], r.dtype)
-        # A loop and not two lines: half as much to compile.
-        return jax.lax.fori_loop(0, 2, lambda k, u: u + dampings[k] * (r - apply(u)) / diagonal, u)
+        return _sweeps(apply, diagonal, r, u)
 
     def _cycle(self, depth: int, alpha: Array, beta: Array, r: Array) -> Array:
         if depth == len(self.levels):
@@ -171,16 +168,22 @@ class Multigrid(eqx.Module):
             return self.eigenvectors @ ((self.eigenvectors.T @ r) / scale)
         level = self.levels[depth]
         diagonal = level.diagonal(alpha, beta)
-        u = _COARSE_DAMPING * r / diagonal
+        u = _DAMPING[0] * r / diagonal
+        u = u + _DAMPING[1] * (r - level.apply(alpha, beta, u)) / diagonal
         below = self._cycle(depth + 1, alpha, beta, level.down.restrict(r - level.apply(alpha, beta, u)))
-        u = u + level.down.prolong(below)
-        return u + _COARSE_DAMPING * (r - level.apply(alpha, beta, u)) / diagonal
+        return _sweeps(lambda u: level.apply(alpha, beta, u), diagonal, r, u + level.down.prolong(below))
 
     @property
     def smallest(self) -> Float[Array, ""]:
         """The smallest eigenvalue of the coarsest level that is not zero."""
         is_zero = self.eigenvalues <= 1e-6 * self.eigenvalues[-1]
         return jnp.min(jnp.where(is_zero, self.eigenvalues[-1], self.eigenvalues))
+
+
+def _sweeps(apply: Callable[[Array], Array], diagonal: Array, r: Array, u: Array) -> Array:
+    """The sweeps after the coarse correction, those before it in reverse. A loop: half as much to compile."""
+    dampings = jnp.asarray(_DAMPING[::-1], r.dtype)
+    return jax.lax.fori_loop(0, len(_DAMPING), lambda k, u: u + dampings[k] * (r - apply(u)) / diagonal, u)
 
 
 def is_available() -> bool:

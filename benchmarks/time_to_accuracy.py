@@ -1,0 +1,256 @@
+"""Error against wall time of every solver choice, and of what a user would write otherwise: Markdown tables, a picture.
+
+python benchmarks/time_to_accuracy.py [--sizes 10000 40000] [--problems heat schnakenberg] [--picture docs/time.png]
+
+All contestants step the same semi-discrete system (the finite element one its own matrices of the same problem), and
+errors are relative to a solution of it at tolerances no contestant uses, so that only time is measured. Seconds are of
+the second call, compiling and factorising for the first time apart; a factorisation that belongs to a step size is part
+of the run. Peers come with the extra `bench`; one that is missing is left out.
+"""
+
+import argparse
+import importlib.util
+import os
+import time
+import warnings
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import diffrax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import scipy.integrate  # noqa: E402
+import scipy.sparse  # noqa: E402
+import scipy.sparse.linalg  # noqa: E402
+
+import ltljax as ltl  # noqa: E402
+
+SIZES = (10_000, 40_000)
+LEVELS = {10_000: 5, 40_000: 6, 160_000: 7}
+TOLERANCES = (1e-3, 1e-5, 1e-7)
+# A contestant that took longer is not asked for more accuracy.
+PATIENCE = 60.0
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, choices=sorted(LEVELS))
+    parser.add_argument("--problems", nargs="+", default=("heat", "schnakenberg"), choices=sorted(PROBLEMS))
+    parser.add_argument("--picture", help="a PNG to draw error over time into")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    found = {}
+    for name in arguments.problems:
+        for size in arguments.sizes:
+            problem = PROBLEMS[name](ltl.shapes.jittered_sphere(LEVELS[size], 0.3, seed=0))
+            found[name, problem.surface.num_vertices] = table(name, problem)
+    if arguments.picture:
+        draw(found, arguments.picture)
+
+
+class Problem:
+    """A system u' = D L u + f(t, u) on a mesh, from u0 to t1."""
+
+    def __init__(self, mesh, equation, u0, t1, explicit, fixed):
+        self.mesh, self.equation, self.u0, self.t1, self.fixed = mesh, equation, u0, t1, fixed
+        self.surface = ltl.Surface.from_mesh(mesh)
+        self.laplacian = scipy.sparse.csc_matrix(ltl.laplacian_matrix(self.surface))
+        self.explicit = explicit
+
+
+def heat(mesh):
+    """u_t = Delta u + x1 from a field with structure on many scales."""
+    x = mesh.vertices
+    u0 = np.exp(-8 * ((x - x[0]) ** 2).sum(axis=1)) + 0.2 * np.sin(9 * x[:, 1])
+    source = x[:, 0]
+    return Problem(
+        mesh, ltl.Diffusion(source=jnp.asarray(source)), u0, 0.5, lambda u: source, (0.05, 0.01, 0.002)
+    )  # fmt: skip
+
+
+def schnakenberg(mesh):
+    """A pattern that grows from noise and settles: gamma 100, a .1, b .9, diffusivities 1 and 10."""
+
+    def rates(species, p):
+        u, v = species
+        return p * (0.1 - u + u**2 * v), p * (0.9 - u**2 * v)
+
+    u0 = np.stack([1 + 0.1 * np.sin(7 * mesh.vertices[:, 0] * mesh.vertices[:, 1]), 0.9 + 0 * mesh.vertices[:, 0]], 1)
+    explicit = lambda u: np.stack(rates((u[:, 0], u[:, 1]), 100.0), axis=1)  # noqa: E731
+    equation = ltl.ReactionDiffusion((1.0, 10.0), rates, params=jnp.array(100.0))
+    return Problem(mesh, equation, u0, 0.5, explicit, (2e-3, 5e-4, 1e-4))
+
+
+PROBLEMS = dict(heat=heat, schnakenberg=schnakenberg)
+
+ADAPTIVE = {
+    "RKC2 (the default)": ltl.RKC2(),
+    "Tsit5": diffrax.Tsit5(),
+    "TRBDF2": ltl.TRBDF2(),
+    "Kvaerno5": diffrax.Kvaerno5(),
+    "KenCarp4": diffrax.KenCarp4(),
+}
+FIXED = {"SBDF2": ltl.SBDF2(), "CrankNicolson": ltl.CrankNicolson()}
+
+
+def table(name, problem):
+    """Print one table; rows by contestant, for the picture."""
+    size = problem.surface.num_vertices
+    print(f"\n### {name}, {size} vertices, to t = {problem.t1}: relative error (seconds)\n")
+    reference = np.asarray(ours(problem, ltl.RKC2(), rtol=1e-10, atol=1e-12)[0])
+    contestants = {
+        label: [lambda tol=tol, s=solver: ours(problem, s, rtol=tol, atol=0.1 * tol) for tol in TOLERANCES]
+        for label, solver in ADAPTIVE.items()
+    }
+    for label, solver in FIXED.items():
+        contestants[label] = [
+            lambda dt=dt, s=solver: ours(problem, s, dt=dt, rtol=1e-6, atol=1e-8) for dt in problem.fixed
+        ]
+    contestants["SciPy BDF"] = [lambda tol=tol: scipy_ivp(problem, "BDF", tol) for tol in TOLERANCES]
+    contestants["SciPy Radau"] = [lambda tol=tol: scipy_ivp(problem, "Radau", tol) for tol in TOLERANCES]
+    contestants["SuperLU, SBDF2"] = [lambda dt=dt: superlu(problem, dt) for dt in problem.fixed]
+    if name == "heat" and importlib.util.find_spec("ngsolve"):
+        contestants["NGSolve, Crank-Nicolson"] = [lambda dt=dt: ngsolve_heat(problem, dt) for dt in problem.fixed]
+    print("| solver | coarse | middle | fine | compile (s) |\n| --- | --- | --- | --- | --- |")
+    rows = {}
+    for label, runs in contestants.items():
+        rows[label], cells, compiling = [], [], 0.0
+        for run in runs:
+            if rows[label] and rows[label][-1][1] > PATIENCE:
+                cells.append("-")
+                continue
+            try:
+                u, seconds, first = run()
+            except (ltl.SolveError, MemoryError) as error:
+                cells.append(type(error).__name__)
+                continue
+            # The finite element system has an error of its own in space: what is compared is its own fine solution.
+            exact = reference if not label.startswith("NGSolve") else ngsolve_heat(problem, problem.fixed[-1] / 4)[0]
+            error = float(np.linalg.norm(u - exact) / np.linalg.norm(exact))
+            rows[label].append((error, seconds))
+            cells.append(f"{error:.1e} ({seconds:.2f})")
+            compiling = max(compiling, first - seconds)
+        cells += ["-"] * (3 - len(cells))
+        print(f"| {label} | " + " | ".join(cells) + f" | {compiling:.1f} |", flush=True)
+    return rows
+
+
+def ours(problem, solver, **how):
+    start = time.perf_counter()
+    run = lambda: ltl.solve(problem.equation, problem.surface, problem.u0, problem.t1, solver=solver, **how)  # noqa: E731
+    jax.block_until_ready(run().us)
+    first = time.perf_counter() - start
+    start = time.perf_counter()
+    us = jax.block_until_ready(run().us)
+    return np.asarray(us[-1]), time.perf_counter() - start, first
+
+
+def scipy_ivp(problem, method, tolerance):
+    """`solve_ivp` with the sparse Jacobian of the diffusion and the pointwise one of the reaction."""
+    shape = problem.u0.shape
+    diffusivities = np.atleast_1d(np.asarray(problem.equation.diffusivity))
+    diffusion = scipy.sparse.block_diag([d * problem.laplacian for d in diffusivities], format="csc")
+    flat = lambda u: u.reshape(len(problem.mesh.vertices), -1).T.ravel()  # noqa: E731
+    field = lambda y: y.reshape(-1, len(problem.mesh.vertices)).T.reshape(shape)  # noqa: E731
+    rate = lambda t, y: diffusion @ y + flat(problem.explicit(field(y)))  # noqa: E731
+
+    def jacobian(t, y):
+        if len(shape) == 1:
+            return diffusion
+        u, step = field(y), 1e-7
+        parts = [[None] * shape[1] for _ in range(shape[1])]
+        base = problem.explicit(u)
+        for s in range(shape[1]):
+            change = (problem.explicit(u + step * np.eye(shape[1])[s]) - base) / step
+            for r in range(shape[1]):
+                parts[r][s] = scipy.sparse.diags(change[:, r])
+        return scipy.sparse.csc_matrix(diffusion + scipy.sparse.bmat(parts))
+
+    start = time.perf_counter()
+    found = scipy.integrate.solve_ivp(
+        rate, (0, problem.t1), flat(problem.u0), method=method, jac=jacobian, rtol=tolerance, atol=0.1 * tolerance,
+        t_eval=[problem.t1],
+    )  # fmt: skip
+    seconds = time.perf_counter() - start
+    return field(found.y[:, -1]), seconds, seconds
+
+
+def superlu(problem, dt):
+    """SBDF2 with one factorisation for each diffusivity."""
+    shape = problem.u0.shape
+    start = time.perf_counter()
+    diffusivities = np.broadcast_to(np.atleast_1d(np.asarray(problem.equation.diffusivity)), shape[1:] or (1,))
+    eye = scipy.sparse.eye(len(problem.mesh.vertices), format="csc")
+    first = [scipy.sparse.linalg.splu(eye - dt * d * problem.laplacian) for d in diffusivities]
+    then = [scipy.sparse.linalg.splu(1.5 * eye - dt * d * problem.laplacian) for d in diffusivities]
+    solve = lambda factors, right: np.stack(  # noqa: E731
+        [f.solve(np.ascontiguousarray(column)) for f, column in zip(factors, right.T, strict=True)], axis=1
+    )
+    u, explicit = problem.u0.reshape(eye.shape[0], -1), lambda u: problem.explicit(u.reshape(shape)).reshape(u.shape)
+    before, mild_before = u, explicit(u)
+    u = solve(first, u + dt * mild_before)
+    for _ in range(round(problem.t1 / dt) - 1):
+        mild = explicit(u)
+        u, before, mild_before = solve(then, 2 * u - before / 2 + dt * (2 * mild - mild_before)), u, mild
+    seconds = time.perf_counter() - start
+    return u.reshape(shape), seconds, seconds
+
+
+def ngsolve_heat(problem, dt):
+    """Linear finite elements on the same triangles, Crank-Nicolson with one sparse Cholesky factorisation."""
+    import netgen.meshing as nm
+    import ngsolve as ng
+
+    mesh = nm.Mesh()
+    mesh.dim = 3
+    points = [mesh.Add(nm.MeshPoint(nm.Pnt(*map(float, vertex)))) for vertex in problem.mesh.vertices]
+    mesh.Add(nm.FaceDescriptor(surfnr=1, domin=1, bc=1))
+    for a, b, c in problem.mesh.faces:
+        mesh.Add(nm.Element2D(1, [points[a], points[b], points[c]]))
+    space = ng.H1(ng.Mesh(mesh), order=1)
+    u, v = space.TnT()
+    stiffness, mass = ng.BilinearForm(space), ng.BilinearForm(space)
+    stiffness += ng.grad(u).Trace() * ng.grad(v).Trace() * ng.ds
+    mass += u * v * ng.ds
+    source = ng.LinearForm(space)
+    source += ng.x * v * ng.ds
+    for form in (stiffness, mass, source):
+        form.Assemble()
+    state = ng.GridFunction(space)
+    state.vec.FV().NumPy()[:] = problem.u0
+    start = time.perf_counter()
+    system = mass.mat.CreateMatrix()
+    system.AsVector().data = mass.mat.AsVector() + dt / 2 * stiffness.mat.AsVector()
+    inverse = system.Inverse(freedofs=space.FreeDofs(), inverse="sparsecholesky")
+    rest = state.vec.CreateVector()
+    for _ in range(round(problem.t1 / dt)):
+        rest.data = dt * source.vec - dt * stiffness.mat * state.vec
+        state.vec.data += inverse * rest
+    seconds = time.perf_counter() - start
+    return np.array(state.vec.FV().NumPy()), seconds, seconds
+
+
+def draw(found, path):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(found), figsize=(6 * len(found), 5), squeeze=False)
+    for axis, ((name, size), rows) in zip(axes[0], found.items(), strict=True):
+        for label, points in rows.items():
+            style = "-o" if label in ADAPTIVE or label in FIXED else "--s"
+            axis.loglog([seconds for _, seconds in points], [error for error, _ in points], style, label=label, ms=4)
+        axis.set(title=f"{name}, {size} vertices", xlabel="seconds", ylabel="relative error")
+        axis.grid(alpha=0.3)
+    axes[0, -1].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
