@@ -1,5 +1,6 @@
 """Strict JAX for every test: 64-bit, no silent promotion of dtype or rank, annotated shapes checked while running."""
 
+import gc
 import os
 import tempfile
 from pathlib import Path
@@ -21,6 +22,14 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 MESHES = Path(__file__).parents[2] / "shared" / "meshes"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_compiled_functions():
+    """Compiled functions are let go of after each file: every one keeps pages mapped, and the kernel allows 65,530."""
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture
