@@ -27,8 +27,8 @@ from .operators import (
     weighted_laplacian,
 )
 from .solve import (
-    RKC2,
     RKL1,
+    RKL2,
     SBDF2,
     TRBDF2,
     BackwardEuler,
@@ -54,8 +54,8 @@ from .surface import InconsistentRowsWarning, Surface
 __version__ = _version("ltljax")
 
 __all__ = [
-    "RKC2",
     "RKL1",
+    "RKL2",
     "SBDF2",
     "TRBDF2",
     "BackwardEuler",

@@ -29,7 +29,7 @@ class Equation(eqx.Module):
         """The part of the rate that is not stiff; what remains, `implicit_rate`, must be affine in u."""
         raise NotImplementedError(
             f"{type(self).__name__} does not say which part of its rate is not stiff. Define explicit_rate and "
-            "implicit_rate, or take a solver that does not split the rate, such as ltl.TRBDF2() or ltl.RKC2()."
+            "implicit_rate, or take a solver that does not split the rate, such as ltl.TRBDF2() or ltl.RKL2()."
         )
 
     def implicit_rate(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:

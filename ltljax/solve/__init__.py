@@ -6,12 +6,12 @@ from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
 from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
 from .restart import RestartError
-from .stabilised import RKC2, RKL1
+from .stabilised import RKL1, RKL2
 from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
 
 __all__ = [
-    "RKC2",
     "RKL1",
+    "RKL2",
     "SBDF2",
     "TRBDF2",
     "BackwardEuler",

@@ -77,7 +77,7 @@ def step(
     if dt * stiffest > 1.02 * reach:
         raise ValueError(
             f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {reach / stiffest:.2g} on "
-            "this surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKC2() or ltl.TRBDF2()."
+            "this surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKL2() or ltl.TRBDF2()."
         )
 
 

@@ -24,7 +24,7 @@ from . import checks
 from .implicit import SBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
-from .stabilised import RKC2
+from .stabilised import RKL2
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
 _OVERFLOW = 1e6
@@ -78,7 +78,7 @@ class Solution(eqx.Module):
         us: (T, V) or (T, V, S) the states at these times.
         t_end: the time reached.
         u_end: the state there.
-        counts: numbers of steps and, with `RKC2` and `RKL1`, of evaluations of the rate.
+        counts: numbers of steps and, with `RKL2` and `RKL1`, of evaluations of the rate.
         result: `diffrax.RESULTS`; an overflow is not a failure of the solver and shows in ``overflowed`` instead.
         overflowed: whether the state became NaN, infinite, or a million times its start.
         stopped: whether ``stop_when`` held.
@@ -149,11 +149,11 @@ def solve(
     """The solution of an evolution equation at given times.
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
-    species, which does not depend on the size of the mesh. The default solver is `RKC2` for ``Monotone`` surfaces,
+    species, which does not depend on the size of the mesh. The default solver is `RKL2` for ``Monotone`` surfaces,
     whose diffusion has eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for
     ``Paper`` ones, of which neither is true. ``solution.stats`` says which it was and why.
 
-    Solvers: any explicit one of diffrax; `RKC2` (second order) and `RKL1` (first, with the maximum principle),
+    Solvers: any explicit one of diffrax; `RKL2` (second order) and `RKL1` (first, with the maximum principle),
     explicit and stabilised; `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`, `5`, implicit;
     `diffrax.KenCarp3`, `4`, `5`, `diffrax.Sil3` and `SBDF2` (fixed steps), diffusion implicit and the reaction
     explicit. Implicit stages are solved by Krylov iteration, preconditioned by multigrid with the extra `amg` and by
@@ -257,7 +257,7 @@ def solve(
 
 def default_solver(surface: Surface) -> diffrax.AbstractSolver:
     """The solver `solve` takes by itself."""
-    return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKC2()
+    return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKL2()
 
 
 def _reason(surface: Surface) -> str:

@@ -12,12 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Damping of Sommeijer, Shampine and Verwer: the stability region keeps a strip around the negative axis.
-_DAMPING = 2 / 13
-# Numbers of stages on offer, about a fifth apart, so at most that much of a step is wasted; odd for RKL1, whose even
-# ones do not damp the stiffest modes.
-_STAGES = np.unique(np.round(np.geomspace(2, 256, 28)).astype(int))
-_ODD_STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
+# Numbers of stages on offer, about a fifth apart, so at most that much of a step is wasted; odd, as even ones do not
+# damp the stiffest modes.
+_STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
 
 
 def bound_of_equation(t, u, args):
@@ -89,18 +86,20 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
 
-class RKC2(_Stabilised):
-    """Runge-Kutta-Chebyshev of second order, explicit, adaptive, for ``u_t = f(t, u)`` with a stiff diffusion part.
+class RKL2(_Stabilised):
+    """Runge-Kutta-Legendre of second order, explicit, adaptive, for ``u_t = f(t, u)`` with a stiff diffusion part.
 
-    With s stages it is stable where ``dt * bound <= 0.65 (s^2 - 1)``, bound being that of the eigenvalues of f's
+    With s stages it is stable where ``dt * bound <= (s^2 + s - 2) / 2``, bound being that of the eigenvalues of f's
     derivative, which lie near the negative real axis. Each step takes the least s for its own length, so the number
     of evaluations grows with the square root of the stiffness, where an explicit method's grows with the stiffness.
+    A step halves what is stiff, which keeps the error estimate from being led by it, and leaves room for eigenvalues
+    off the axis; Chebyshev's polynomials reach 30 % further with s stages, and have neither.
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
 
-    Source: Sommeijer, Shampine and Verwer (1998), RKC: an explicit solver for parabolic PDEs,
-    doi:10.1016/S0377-0427(97)00219-7, equations 2.1 to 2.6 (the formula), 2.10 (the error estimate).
+    Source: Meyer, Balsara and Aslam (2014), A stabilized Runge-Kutta-Legendre method for explicit super-time-stepping
+    of parabolic and mixed equations, doi:10.1016/j.jcp.2013.08.021, equations 14 to 18.
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
@@ -112,11 +111,15 @@ class RKC2(_Stabilised):
     @staticmethod
     @functools.cache
     def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        rows = [_row(int(stages)) for stages in _STAGES]
-        return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"stages": _STAGES}
+        s, j = _STAGES[:, None], _stage_numbers()
+        b = np.where(j < 2, 1 / 3, (j**2 + j - 2) / (2 * j * (j + 1)))
+        c = (j**2 + j - 2) / (s**2 + s - 2)
+        c[:, 1] = c[:, 2] / 3
+        return _legendre(b, 4 / (s**2 + s - 2), c)
 
     def _error(self, increment, dt, rate0, rate1):
-        return -0.8 * increment + 0.4 * dt * (rate0 + rate1)
+        # The third derivative's share in the error is 1/18, that in the trapezoidal rule's 1/12.
+        return (dt * (rate0 + rate1) / 2 - increment) * 2 / 3
 
 
 class RKL1(_Stabilised):
@@ -127,9 +130,7 @@ class RKL1(_Stabilised):
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
 
-    Source: Meyer, Balsara and Aslam (2014), A stabilized Runge-Kutta-Legendre method for explicit super-time-stepping
-    of parabolic and mixed equations, doi:10.1016/j.jcp.2013.08.021, equations 8 to 11 (the formula), section 4 (the
-    maximum principle).
+    Source: as of `RKL2`, equations 8 to 11 (the formula), section 4 (the maximum principle).
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
@@ -145,43 +146,25 @@ class RKL1(_Stabilised):
     @staticmethod
     @functools.cache
     def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        s = _ODD_STAGES[:, None]
-        j = np.maximum(np.arange(s[-1, 0] + 1), 1)[None]
-        table = dict(mu=(2 * j - 1) / j, nu=(1 - j) / j, mu_rate=(2 * j - 1) / j * 2 / (s**2 + s))
-        table = {name: np.broadcast_to(values, (len(s), j.size)) for name, values in table.items()}
-        c = np.arange(j.size)[None] * (np.arange(j.size)[None] + 1) / (s**2 + s)
-        reach = (s**2 + s)[:, 0].astype(float)
-        return table | dict(gamma_rate=np.zeros_like(c), c=c, reach=reach, stages=_ODD_STAGES)
+        s, j = _STAGES[:, None], _stage_numbers()
+        return _legendre(np.ones(j.shape), 2 / (s**2 + s), (j**2 + j) / (s**2 + s))
 
     def _error(self, increment, dt, rate0, rate1):
         return 0.5 * dt * (rate0 + rate1) - increment
 
 
-def _row(s: int) -> dict[str, np.ndarray]:
-    w0 = 1 + _DAMPING / s**2
-    # Chebyshev polynomials and their first two derivatives at w0, by the three-term recurrence.
-    T, dT, ddT = np.zeros(s + 1), np.zeros(s + 1), np.zeros(s + 1)
-    T[:2], dT[1] = (1, w0), 1
-    for j in range(2, s + 1):
-        T[j] = 2 * w0 * T[j - 1] - T[j - 2]
-        dT[j] = 2 * T[j - 1] + 2 * w0 * dT[j - 1] - dT[j - 2]
-        ddT[j] = 4 * dT[j - 1] + 2 * w0 * ddT[j - 1] - ddT[j - 2]
-    w1 = dT[s] / ddT[s]
-    b = np.zeros(s + 1)
-    b[2:] = ddT[2:] / dT[2:] ** 2
-    # As the code of the source has it: then the first stage stands where its time says, c[1] = mu_rate[1].
-    b[:2] = b[2]
-    a = 1 - b * T
-    size = int(_STAGES[-1]) + 1
-    mu, nu, mu_rate, gamma_rate, c = (np.zeros(size) for _ in range(5))
-    mu_rate[1] = b[1] * w1
-    mu[2 : s + 1] = 2 * b[2:] * w0 / b[1:-1]
-    nu[2 : s + 1] = -b[2:] / b[:-2]
-    mu_rate[2 : s + 1] = 2 * b[2:] * w1 / b[1:-1]
-    gamma_rate[2 : s + 1] = -a[1:-1] * mu_rate[2 : s + 1]
-    c[2 : s + 1] = w1 * ddT[2:] / dT[2:]
-    c[1] = c[2] / (4 * w0)
-    return dict(
-        mu=mu, nu=nu, mu_rate=mu_rate, gamma_rate=gamma_rate, c=c,
-        reach=np.array(2 / 3 * (s**2 - 1) * (1 - 2 / 15 * _DAMPING)),
-    )  # fmt: skip
+def _stage_numbers() -> np.ndarray:
+    # Entry 0 is of no stage; the one in its place keeps the formulas finite.
+    return np.maximum(np.arange(_STAGES[-1] + 1), 1).astype(float)
+
+
+def _legendre(b: np.ndarray, scale: np.ndarray, c: np.ndarray) -> dict[str, np.ndarray]:
+    """The recurrence of Legendre polynomials, stage j being 1 - b[j] + b[j] P_j(1 + scale z) of z = dt lambda."""
+    j = _stage_numbers()
+    before, last = np.roll(b, 2), np.roll(b, 1)
+    mu, nu = (2 * j - 1) / j * b / last, (1 - j) / j * b / before
+    mu_rate = mu * scale
+    mu_rate[:, 1:2] = b[1] * scale
+    table = dict(mu=mu, nu=nu, mu_rate=mu_rate, gamma_rate=(last - 1) * mu_rate, c=c)
+    table = {name: np.broadcast_to(values, mu_rate.shape) for name, values in table.items()}
+    return table | dict(reach=2 / scale[:, 0], stages=_STAGES)
