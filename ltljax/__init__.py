@@ -10,8 +10,18 @@ equations are made of operators; `solve` carries them through time.
 
 from importlib.metadata import version as _version
 
-from .elliptic import EllipticStencil, elliptic_stencil
-from .equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
+from .elliptic import EllipticStencil, direction_tensor, elliptic_stencil
+from .equations import (
+    CahnHilliard,
+    Diffusion,
+    Dirichlet,
+    Equation,
+    Moving,
+    Neumann,
+    ReactionDiffusion,
+    Robin,
+    kinetics,
+)
 from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
 from .operators import (
@@ -24,8 +34,10 @@ from .operators import (
     integrate,
     laplacian,
     laplacian_matrix,
+    spectral_bound,
     weighted_laplacian,
 )
+from .show import plot, plot_dispersion, view
 from .solve import (
     RKL1,
     RKL2,
@@ -33,7 +45,9 @@ from .solve import (
     TRBDF2,
     BackwardEuler,
     CrankNicolson,
+    Dispersion,
     Eigenmodes,
+    Explanation,
     GrowingModesWarning,
     IncompatibleSourceWarning,
     Multigrid,
@@ -41,7 +55,9 @@ from .solve import (
     Solution,
     SolveError,
     Steady,
+    dispersion,
     eigenmodes,
+    explain,
     geodesic_distance,
     multigrid,
     poisson,
@@ -59,19 +75,23 @@ __all__ = [
     "SBDF2",
     "TRBDF2",
     "BackwardEuler",
+    "CahnHilliard",
     "CrankNicolson",
     "Curvature",
     "Diffusion",
     "Dirichlet",
+    "Dispersion",
     "Eigenmodes",
     "EllipticStencil",
     "Equation",
+    "Explanation",
     "GrowingModesWarning",
     "IncompatibleSourceWarning",
     "InconsistentRowsWarning",
     "Mesh",
     "MeshError",
     "Monotone",
+    "Moving",
     "Multigrid",
     "Neumann",
     "Paper",
@@ -84,9 +104,12 @@ __all__ = [
     "Steady",
     "Surface",
     "curvature",
+    "direction_tensor",
+    "dispersion",
     "divergence",
     "eigenmodes",
     "elliptic_stencil",
+    "explain",
     "geodesic_distance",
     "gradient",
     "growth_rate",
@@ -97,10 +120,14 @@ __all__ = [
     "laplacian_matrix",
     "load_mesh",
     "multigrid",
+    "plot",
+    "plot_dispersion",
     "poisson",
     "screened_poisson",
     "shapes",
     "solve",
+    "spectral_bound",
     "steady_state",
+    "view",
     "weighted_laplacian",
 ]

@@ -1,6 +1,8 @@
-"""The command line: ``ltljax run``, ``ltljax list``, ``ltljax info``."""
+"""The command line: ``ltljax run``, ``ltljax new``, ``ltljax list``, ``ltljax info``."""
 
 import argparse
+import dataclasses
+import difflib
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -46,16 +48,18 @@ def _parser() -> argparse.ArgumentParser:
 
     run_ = commands.add_parser("run", help="solve a scenario and write pictures and data")
     run_.set_defaults(command=_run)
-    run_.add_argument("scenario", choices=scenario.SCENARIOS, help="what to solve (see: ltljax list)")
-    run_.add_argument("--mesh", default="sphere", help="sphere, torus, disk, or a mesh file (default: sphere)")
+    run_.add_argument("scenario", help="what to solve: a name (see: ltljax list) or a scenario file (see: ltljax new)")
+    run_.add_argument("--mesh", help="sphere, torus, disk, or a mesh file (default: the scenario's own, or sphere)")
+    run_.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
+        help="a value of a scenario file, such as kinetics.feed=0.05; may be given several times",
+    )  # fmt: skip
     run_.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
     run_.add_argument(
         "--source", choices=scenario.SOURCES, help="heat on the torus: the source (default: angle-zero-mean)"
     )
     run_.add_argument("--as-published", action="store_true", help="turing: the paper's parameters, which stay uniform")
-    run_.add_argument(
-        "--scheme", choices=("monotone", "polynomial", "paper"), default="monotone", help="default: monotone"
-    )
+    run_.add_argument("--scheme", choices=scenario.SCHEMES, help="default: the scenario's own, or monotone")
     run_.add_argument("--degree", type=int, choices=(3, 4), help="of the scheme polynomial (default: 4)")
     run_.add_argument(
         "--boundary",
@@ -66,9 +70,9 @@ def _parser() -> argparse.ArgumentParser:
         "one boundary loop; may be given several times (default: neumann=0)",
     )
     run_.add_argument("--t1", type=_positive, help="end of the run (default: the scenario's)")
-    run_.add_argument("--frames", type=_count, default=60, help="states kept, evenly spaced in time (default: 60)")
-    run_.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default: 0)")
-    run_.add_argument("--dtype", choices=("float32", "float64"), default="float64", help="default: float64")
+    run_.add_argument("--frames", type=_count, help="states kept, evenly spaced in time (default: mostly 60)")
+    run_.add_argument("--seed", type=_seed, help="of the random numbers (default: 0)")
+    run_.add_argument("--dtype", choices=("float32", "float64"), help="default: mostly float64")
     run_.add_argument(
         "--keep-scale", action="store_true", help="mesh files: do not scale the area to the unit sphere's"
     )
@@ -76,6 +80,10 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted: the same command, the same --out"
     )
+
+    new = commands.add_parser("new", help="print a scenario file to start from: ltljax new gray-scott > my.toml")
+    new.set_defaults(command=_new)
+    new.add_argument("scenario", choices=scenario.library(), metavar="NAME", help="one of those of: ltljax list")
 
     listing = commands.add_parser("list", help="the scenarios and built-in meshes")
     listing.set_defaults(command=_list)
@@ -111,11 +119,19 @@ def _seed(text: str) -> int:
 
 def _list(options: argparse.Namespace) -> int:
     del options
-    for name, make in scenario.SCENARIOS.items():
-        print(f"{name:8} {(make.__doc__ or '').splitlines()[0]}")
+    rows = {name: (make.__doc__ or "").splitlines()[0] for name, make in scenario.SCENARIOS.items()}
+    rows |= {name: scenario.title(text) for name, text in scenario.library().items()}
+    for name, says in rows.items():
+        print(f"{name:20} {says}")
     print(
         f"\nmeshes: {', '.join(scenario.BUILT_IN)}, or any mesh file. Start one with: ltljax run turing --mesh sphere"
     )
+    print("All but heat and turing are files: ltljax new gray-scott > my.toml, change it, ltljax run my.toml")
+    return 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    print(scenario.library()[options.scenario], end="")
     return 0
 
 
@@ -124,29 +140,68 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
-def _scheme(options: argparse.Namespace) -> Scheme:
-    if options.scheme != "polynomial" and options.degree is not None:
-        raise ValueError(f"--degree {options.degree} needs --scheme polynomial.")
-    if options.scheme == "polynomial":
-        return Polynomial(options.degree or 4)
-    return Paper() if options.scheme == "paper" else Monotone()
+def _scheme(name: str, degree: int | None) -> Scheme:
+    if name != "polynomial" and degree is not None:
+        raise ValueError(f"--degree {degree} needs --scheme polynomial.")
+    if name == "polynomial":
+        return Polynomial(degree or 4)
+    return Paper() if name == "paper" else Monotone()
 
 
 def _run(options: argparse.Namespace) -> int:
-    jax.config.update("jax_enable_x64", options.dtype == "float64")
-    chosen = scenario.Options(
-        mesh=options.mesh,
-        source=options.source,
-        boundary=tuple(options.boundary),
-        as_published=options.as_published,
-        keep_scale=options.keep_scale,
-        repair=options.repair,
-        seed=options.seed,
-        t1=options.t1,
-    )
-    example = scenario.SCENARIOS[options.scenario](chosen)
+    # Scenario files are read in full precision, whatever the run's is.
+    jax.config.update("jax_enable_x64", True)
+    if options.scenario in scenario.SCENARIOS:
+        if options.changes:
+            raise ValueError(f"--set is for scenario files; {options.scenario} is none (see: ltljax list).")
+        chosen = scenario.Options(
+            mesh=options.mesh or "sphere",
+            source=options.source,
+            boundary=tuple(options.boundary),
+            as_published=options.as_published,
+            keep_scale=options.keep_scale,
+            repair=options.repair,
+            seed=options.seed or 0,
+            t1=options.t1,
+        )
+        example, record = scenario.SCENARIOS[options.scenario](chosen), dataclasses.asdict(chosen)
+    else:
+        example, mesh = _from_file(options)
+        record = dict(scenario=options.scenario, mesh=mesh, changes=options.changes)
+    dtype = options.dtype or example.settings.dtype
+    jax.config.update("jax_enable_x64", dtype == "float64")
     run(
-        example, chosen, scheme=_scheme(options), dtype=options.dtype, frames=options.frames, out=options.out,
-        resume=options.resume,
+        example, record, scheme=_scheme(options.scheme or example.settings.scheme, options.degree), dtype=dtype,
+        frames=options.frames or example.frames, out=options.out, resume=options.resume,
     )  # fmt: skip
     return 0
+
+
+def _from_file(options: argparse.Namespace) -> tuple[scenario.Scenario, str]:
+    """The scenario of a file or of the library, with what the command line changes; and its mesh in words."""
+    for flag in ("source", "boundary", "as_published"):
+        if getattr(options, flag):
+            raise ValueError(f"--{flag.replace('_', '-')} is for heat and turing; in a scenario file write it down.")
+    texts, path = scenario.library(), Path(options.scenario)
+    if options.scenario in texts:
+        text, folder = texts[options.scenario], Path()
+    elif path.suffix == ".toml":
+        text, folder = path.read_text(encoding="utf-8"), path.parent
+    else:
+        names = (*scenario.SCENARIOS, *texts)
+        near = difflib.get_close_matches(options.scenario, names, n=1)
+        raise ValueError(
+            f"Expected the name of a scenario or a file that ends in .toml, found {options.scenario!r}"
+            f"{f' (did you mean {near[0]}?)' if near else ''}. Names: {', '.join(names)}."
+        )
+    given = {"time.end": options.t1, "time.frames": options.frames, "seed": options.seed}
+    given |= {"solver.dtype": options.dtype, "solver.scheme": options.scheme}
+    given |= {"mesh.repair": options.repair or None, "mesh.scale": "keep" if options.keep_scale else None}
+    changes = {key: value for key, value in given.items() if value is not None}
+    changes |= dict(scenario.parse_change(change) for change in options.changes)
+    mesh_file = None
+    if options.mesh in scenario.BUILT_IN:
+        changes["mesh"] = {"shape": options.mesh}
+    elif options.mesh is not None:
+        mesh_file = Path(options.mesh)
+    return scenario.read(text, options.scenario, folder, changes, mesh_file), options.mesh or "its own mesh"

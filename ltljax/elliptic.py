@@ -27,6 +27,7 @@ from .tables import (
     difference_sum,
     reverse_weights,
     reversible,
+    slot_sum,
 )
 
 # Where not every condition can be met the drift is to be exact, and the excess of diffusion the least.
@@ -41,6 +42,7 @@ class EllipticStencil(eqx.Module):
         weights: one array (K, N) per block of the table, non-negative.
         reverse: the same weights in the order of the table's reverse, for derivatives in reverse mode.
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
+        mean_diffusion: half the trace of D in the tangent plane, its mean over the vertices.
         lift: how neighbours are laid into the tangent planes.
     """
 
@@ -48,6 +50,7 @@ class EllipticStencil(eqx.Module):
     weights: PerBlock
     reverse: ReverseWeights | None
     residual: Float[AnyArray, " V"]
+    mean_diffusion: Float[AnyArray, ""]
     lift: Lift = eqx.field(static=True)
 
     def __call__(self, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
@@ -57,6 +60,10 @@ class EllipticStencil(eqx.Module):
     def matrix(self) -> scipy.sparse.csr_array:
         """The operator as a SciPy sparse matrix (V, V) (host)."""
         return difference_matrix(self.table, self.weights)
+
+    def spectral_bound(self) -> Float[Array, ""]:
+        """An upper bound of the magnitude of the eigenvalues, by Gershgorin's discs."""
+        return 2 * jnp.max(slot_sum(self.table, self.weights))
 
     def with_coefficients(
         self, surface: Surface, diffusion: AnyArray | float, drift: AnyArray | None = None
@@ -68,9 +75,9 @@ class EllipticStencil(eqx.Module):
         targets = _targets(surface.geometry.frames, diffusion, drift)
         frames, kinds = surface.geometry.frames, surface.topology.kinds
         weights, residual = _rows(surface.vertices, frames, kinds, targets, self.table, self.lift)
-        found = (weights, reverse_weights(self.table, weights), residual)
-        weights, reverse, residual = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, weights, reverse, residual, self.lift)
+        found = (weights, reverse_weights(self.table, weights), residual, _mean_diffusion(targets))
+        weights, reverse, residual, mean = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
+        return EllipticStencil(self.table, weights, reverse, residual, mean, self.lift)
 
 
 def elliptic_stencil(
@@ -128,9 +135,33 @@ def elliptic_stencil(
         residual = record.residual
     table = reversible(build_table(*rows))
     weights, residual = _rows(vertices, frames, kinds, targets, table, lift)
-    found = (weights, reverse_weights(table, weights), residual)
-    weights, reverse, residual = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
-    return EllipticStencil(jax.tree.map(jnp.asarray, table), weights, reverse, residual, lift)
+    found = (weights, reverse_weights(table, weights), residual, _mean_diffusion(targets))
+    weights, reverse, residual, mean = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
+    return EllipticStencil(jax.tree.map(jnp.asarray, table), weights, reverse, residual, mean, lift)
+
+
+def direction_tensor(
+    surface: Surface, direction: Float[AnyArray, "V 3"], along: float | AnyArray, across: float | AnyArray
+) -> Float[Array, "V 3 3"]:
+    """A diffusion tensor for `elliptic_stencil`: ``along`` in a direction, ``across`` at right angles to it.
+
+    Of the direction the tangent part counts, its length and sign do not; where that part vanishes the tensor is
+    isotropic, the mean of both. Principal directions of curvature make stripes that follow a shape.
+
+    Args:
+        surface: the surface.
+        direction: (V, 3).
+        along: a number or (V,).
+        across: a number or (V,).
+    """
+    normals = surface.normals
+    tangent = direction - jnp.sum(direction * normals, axis=1, keepdims=True) * normals
+    squared = jnp.sum(tangent**2, axis=1)[:, None, None]
+    plane = jnp.eye(3, dtype=normals.dtype)[None] - normals[:, :, None] * normals[:, None, :]
+    has_none = squared <= jnp.finfo(normals.dtype).tiny
+    onto = jnp.where(has_none, plane / 2, tangent[:, :, None] * tangent[:, None, :] / jnp.where(has_none, 1, squared))
+    along, across = (jnp.asarray(value, normals.dtype).reshape(-1, 1, 1) for value in (along, across))
+    return across * plane + (along - across) * onto
 
 
 @eqx.filter_jit
@@ -174,6 +205,10 @@ def _targets(frames: AnyArray, diffusion: AnyArray | float, drift: AnyArray | No
     if drift is not None:
         b = xp.einsum("vac,vc->av", frames, xp.asarray(drift, dtype=frames.dtype))
     return xp.stack([b[0], b[1], 2 * xy, 2 * xx, 2 * yy])[None]
+
+
+def _mean_diffusion(targets: AnyArray) -> AnyArray:
+    return targets.__array_namespace__().asarray((targets[0, 3] + targets[0, 4]).mean() / 4)
 
 
 def _rows(vertices, frames, kinds, targets, table: Table, lift: Lift) -> tuple[PerBlock, AnyArray]:

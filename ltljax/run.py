@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import json
 import platform
+import shutil
 import time
 import warnings
 from collections.abc import Iterable
@@ -17,18 +18,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tomli_w
 
 from .lifting.schemes import Monotone, Scheme
 from .mesh import Mesh
 from .operators import integrate
 from .progress import watched
-from .scenario import Options, Scenario
+from .scenario import Scenario
 from .solve import GrowingModesWarning, SolveError, solve
 from .solve.restart import Keeper, fingerprint
 from .surface import Surface
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
-_RTOL, _ATOL = 1e-4, 1e-6
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000
 
@@ -45,7 +46,14 @@ class _Progress:
 
 
 def run(
-    example: Scenario, options: Options, *, scheme: Scheme, dtype: str, frames: int, out: Path, resume: bool = False
+    example: Scenario,
+    options: dict[str, Any],
+    *,
+    scheme: Scheme,
+    dtype: str,
+    frames: int,
+    out: Path,
+    resume: bool = False,
 ) -> dict[str, Any]:
     """Solve a scenario and write its results.
 
@@ -53,7 +61,7 @@ def run(
 
     Args:
         example: the scenario.
-        options: what it was made from, for the record.
+        options: what it was made from, for the record; ``mesh`` among it.
         scheme: the scheme.
         dtype: ``"float32"`` or ``"float64"``.
         frames: how many states to keep, evenly spaced in time, besides the first.
@@ -74,14 +82,14 @@ def run(
         warnings.simplefilter("always")
         surface = Surface.from_mesh(mesh, scheme, dtype, progress=mesh.num_vertices > _LONG_BUILD)
     build_seconds = time.perf_counter() - start
-    print(f"{example.name} on {options.mesh}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, {scheme}")
+    print(f"{example.name} on {options['mesh']}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, {scheme}")
     _print_notes((*example.notes, *cautions))
 
     reached = _Progress([0.0], [example.u0])
     times = np.linspace(0, example.t1, frames + 1)
     same = dict(
         mesh=fingerprint((mesh.vertices, mesh.faces)),
-        scenario=fingerprint((example.name, example.parameters, example.u0, dataclasses.asdict(options))),
+        scenario=fingerprint((example.name, example.parameters, example.u0, options)),
         numbers=fingerprint((times, repr(scheme), dtype)),
     )
     keeper = Keeper(out / "restart", same, resume)
@@ -95,16 +103,18 @@ def run(
     for name, value in measured.items():
         print(f"{name.replace('_', ' '):32} {_readable(value)}")
 
-    files = _write(example, out, reached)
+    files = _write(example, np.asarray(surface.normals), out, reached)
+    if example.resolved is not None:
+        files += _keep_scenario(example, out)
     summary = dict(
         scenario=example.name,
-        options=dataclasses.asdict(options),
+        options=options,
         parameters=example.parameters,
         scheme=repr(surface.scheme),
         dtype=dtype,
         frames=frames,
         t1=example.t1,
-        tolerances=dict(rtol=_RTOL, atol=_ATOL),
+        tolerances=dict(rtol=example.settings.rtol, atol=example.settings.atol),
         notes=example.notes,
         failure=None if failure is None else str(failure),
         measured=measured,
@@ -124,7 +134,10 @@ def run(
 
 def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _Progress, keeper: Keeper) -> None:
     """Carry the state from each time to the next, so that it can be shown, kept, and stopped in between."""
-    equation = example.make_equation(surface)
+    equation, settings = example.make_equation(surface), example.settings
+    how: dict[str, Any] = dict(
+        solver=settings.solver, rtol=settings.rtol, atol=settings.atol, dt=settings.dt, throw=False
+    )
     for state, record in zip(keeper.states(), keeper.done, strict=True):
         reached.times.append(record["t"])
         reached.states.append(state)
@@ -136,14 +149,14 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
     with warnings.catch_warnings(record=True) as cautions:
         warnings.simplefilter("always")
         # From a time to itself: nothing to step, everything to compile.
-        jax.block_until_ready(solve(equation, surface, u, 0.0, t0=0.0, throw=False, rtol=_RTOL, atol=_ATOL).us)
+        jax.block_until_ready(solve(equation, surface, u, 0.0, t0=0.0, **how).us)
     _print_notes(cautions)
     reached.compile_seconds = time.perf_counter() - start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GrowingModesWarning)  # said once
         for t0, t1 in watched("time", unit="frame")(list(itertools.pairwise(times.tolist()))[len(keeper.done) :]):
             start = time.perf_counter()
-            solution = solve(equation, surface, u, t1, t0=t0, throw=False, rtol=_RTOL, atol=_ATOL)
+            solution = solve(equation, surface, u, t1, t0=t0, **how)
             u = jax.block_until_ready(solution.u_end)
             reached.step_seconds += time.perf_counter() - start
             for name, count in solution.counts.items():
@@ -204,8 +217,8 @@ def count_maxima(mesh: Mesh, values: np.ndarray) -> int:
     return int(np.sum((values > highest) & (values > values.mean())))
 
 
-def _write(example: Scenario, out: Path, reached: _Progress) -> list[str]:
-    from .output import colors, files, pictures
+def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress) -> list[str]:
+    from .output import colors, files, pictures, viewer
 
     # What was computed in an order that keeps neighbours together is written in that of the source.
     order = example.mesh.source_order
@@ -223,18 +236,33 @@ def _write(example: Scenario, out: Path, reached: _Progress) -> list[str]:
     files.write_series(out / f"{name}.pvd", times, frames)
 
     limits = _limits([state[shown] for state in fields])
-    files.write_ply(out / f"{name}.ply", vertices, faces, colors.vertex_colors(fields[-1][shown], limits))
-    written = [f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply"]
+    colormap = example.settings.colormap
+    shades = colors.vertex_colors(fields[-1][shown], limits, colormap)
+    files.write_ply(out / f"{name}.ply", vertices, faces, shades)
+    files.write_glb(out / f"{name}.glb", vertices, faces, shades, normals[order])
+    whole = {species: np.stack([state[species] for state in fields]) for species in (shown, *example.species)}
+    viewer.write_viewer(out / f"{name}.html", vertices, faces, times, whole, example.title or name, colormap)
+    written = [f"{name}.html", f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply", f"{name}.glb"]
     if not pictures.can_draw():
         print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
         return written
-    picture = pictures.Picture(vertices, faces, shown, limits)
+    picture = pictures.Picture(vertices, faces, shown, limits, colormap)
     captions = [f"{name}   t = {t:.3g}" for t in times]
     images = [picture.draw(state[shown], text) for state, text in zip(fields, captions, strict=True)]
     picture.close()
     pictures.write_png(out / f"{name}.png", images[-1])
     animation = pictures.write_animation(out / f"{name}.mp4", images)
     return [*written, f"{name}.png", animation.name]
+
+
+def _keep_scenario(example: Scenario, out: Path) -> list[str]:
+    """The scenario with every value, beside the files it names: run it again, and the same comes out."""
+    for file in example.files:
+        if not (out / file.name).exists() or not file.samefile(out / file.name):
+            shutil.copyfile(file, out / file.name)
+    text = tomli_w.dumps({key: value for key, value in (example.resolved or {}).items() if value not in ({}, [])})
+    (out / "scenario.toml").write_text(f"# Every value of this run: ltljax run scenario.toml\n{text}", encoding="utf-8")
+    return ["scenario.toml"]
 
 
 def _limits(states: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -175,7 +175,7 @@ def test_the_published_scheme_on_an_irregular_mesh_stops_with_its_time_and_reaso
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["run", "cooking"], "invalid choice: 'cooking'"),
+        (["run", "cooking"], "found 'cooking'"),
         (["run", "heat", "--mesh", "nowhere.obj"], "nowhere.obj"),
         (["run", "heat", "--t1", "-1"], "expected a positive number, found '-1'"),
         (["run", "heat", "--t1", "nan"], "expected a positive number"),

@@ -2,8 +2,20 @@
 
 from . import kinetics
 from .boundary import Dirichlet, Neumann, Robin
+from .cahn_hilliard import CahnHilliard
 from .diffusion import Diffusion
 from .equation import Equation
+from .moving import Moving
 from .reaction_diffusion import ReactionDiffusion
 
-__all__ = ["Diffusion", "Dirichlet", "Equation", "Neumann", "ReactionDiffusion", "Robin", "kinetics"]
+__all__ = [
+    "CahnHilliard",
+    "Diffusion",
+    "Dirichlet",
+    "Equation",
+    "Moving",
+    "Neumann",
+    "ReactionDiffusion",
+    "Robin",
+    "kinetics",
+]

@@ -1,18 +1,22 @@
-"""Several species that diffuse and react."""
+"""Several species that diffuse, drift and react."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..operators import spectral_bound
+from ..elliptic import EllipticStencil
+from ..operators import spectral_bound, weighted_laplacian
 from ..surface import Surface
 from . import boundary as bounds
-from .boundary import Conditions
+from .boundary import Conditions, Neumann, Robin
 from .equation import Equation
 from .kinetics import Kinetics
+
+# How one species spreads: a number, a field over the surface, or an operator of its own.
+Spread = Float[Array, ""] | Float[Array, " V"] | EllipticStencil
 
 
 class ReactionDiffusion(Equation):
@@ -21,24 +25,45 @@ class ReactionDiffusion(Equation):
     The state is one array (V, S).
 
     Attributes:
-        diffusivity: (S,) one non-negative number for each species.
+        diffusivity: for each species how it spreads: a number D for D Delta u; a non-negative field (V,) for
+            div(D grad u); an `EllipticStencil` for D : Hess u + b . grad u, such as diffusion along a direction field
+            or drift with a flow (b is minus the velocity). (S,) where all are numbers, else a tuple.
         reaction: a `Kinetics`, or a plain function ``((u, v), params) -> (du, dv)`` of the species at one point.
         params: the parameters of a plain function; a pytree of scalars, or of fields (V,) over the surface.
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivatives vanish.
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivatives vanish. Fluxes
+            need numbers as diffusivities.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 4; Turing (1952), doi:10.1098/rstb.1952.0012.
     """
 
-    diffusivity: Float[Array, " S"]
+    diffusivity: Float[Array, " S"] | tuple[Spread, ...]
     reaction: Kinetics
     boundary: Conditions
 
     def __init__(
-        self, diffusivity: Any, reaction: Kinetics | Callable, params: Any = None, boundary: Conditions | None = None
+        self,
+        diffusivity: Sequence[Any] | Array,
+        reaction: Kinetics | Callable,
+        params: Any = None,
+        boundary: Conditions | None = None,
     ):
-        self.diffusivity = jnp.stack([jnp.asarray(d, jnp.result_type(float)) for d in diffusivity])
+        spreads = tuple(
+            d if isinstance(d, EllipticStencil) else jnp.asarray(d, jnp.result_type(float)) for d in diffusivity
+        )
+        are_numbers = all(not isinstance(d, EllipticStencil) and d.ndim == 0 for d in spreads)
+        self.diffusivity = jnp.stack(cast(list[Array], spreads)) if are_numbers else spreads
         self.reaction = reaction if isinstance(reaction, Kinetics) else Kinetics(reaction, params)
         self.boundary = bounds.as_tuple(boundary)
+        if not are_numbers and any(isinstance(condition, Neumann | Robin) for condition in self.boundary):
+            raise ValueError(
+                "Neumann and Robin conditions need a number as the diffusivity of every species. Leave them out for "
+                "vanishing normal derivatives, or hold values with ltl.Dirichlet."
+            )
+
+    @property
+    def num_species(self) -> int:
+        """The number of species."""
+        return len(self.diffusivity)
 
     def rate(self, t, surface: Surface, u):
         """The time derivative: diffusion of every species and the reaction at every vertex."""
@@ -48,16 +73,23 @@ class ReactionDiffusion(Equation):
         """The diffusion of every species; of a value that is held, that value's rate."""
         self._check(u)
         u = self.held(t, surface, u)
-        diffused = bounds.bounded_laplacian(surface, self.boundary, t, u)
-        return bounds.held_rate(surface, self.boundary, t, u, self.diffusivities(u)[None] * diffused)
+        if isinstance(self.diffusivity, tuple):
+            columns = [_spread(surface, spread, u[:, s]) for s, spread in enumerate(self.diffusivity)]
+            spread = jnp.stack(columns, axis=1)
+        else:
+            spread = self.diffusivities(u)[None] * bounds.bounded_laplacian(surface, self.boundary, t, u)
+        return bounds.held_rate(surface, self.boundary, t, u, spread)
 
     def explicit_rate(self, t, surface: Surface, u):
         """The reaction at every vertex; zero where a value is held."""
         return bounds.released(surface, self.boundary, self.reaction(self.held(t, surface, u)))
 
     def diffusivities(self, u):
-        """One number for each species."""
-        return self.diffusivity.astype(u.dtype)
+        """One number for each species; of what varies, the mean."""
+        if not isinstance(self.diffusivity, tuple):
+            return self.diffusivity.astype(u.dtype)
+        means = [d.mean_diffusion if isinstance(d, EllipticStencil) else jnp.mean(d) for d in self.diffusivity]
+        return jnp.stack([mean.astype(u.dtype) for mean in means])
 
     @property
     def conditions(self):
@@ -75,11 +107,22 @@ class ReactionDiffusion(Equation):
         columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in species]
         reaction = jnp.max(sum(jnp.abs(column) for column in columns))
         bound = spectral_bound(surface) + bounds.stiffness(surface, self.boundary, t, u)
-        return jnp.max(self.diffusivity.astype(u.dtype)) * bound + reaction
+        fastest = [
+            d.spectral_bound() if isinstance(d, EllipticStencil) else jnp.max(d.astype(u.dtype)) * bound
+            for d in self.diffusivity
+        ]
+        return jnp.max(jnp.stack(fastest)) + reaction
 
     def _check(self, u: Array) -> None:
-        if u.ndim != 2 or u.shape[1] != self.diffusivity.shape[0]:
+        if u.ndim != 2 or u.shape[1] != self.num_species:
             raise ValueError(
-                f"Expected a state of shape (V, {self.diffusivity.shape[0]}), one column for each diffusivity, "
-                f"found {u.shape}."
+                f"Expected a state of shape (V, {self.num_species}), one column for each diffusivity, found {u.shape}."
             )
+
+
+def _spread(surface: Surface, spread: Spread, u: Float[Array, " V"]) -> Float[Array, " V"]:
+    """What the diffusion of one species makes of it."""
+    if isinstance(spread, EllipticStencil):
+        return spread(u)
+    conductivity = jnp.broadcast_to(spread.astype(u.dtype), u.shape)
+    return weighted_laplacian(surface, conductivity, u)

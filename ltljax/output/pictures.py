@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from .colors import colormap_samples
+
 # Both sides, a little from the right and from above; y is up, as in most mesh files.
 _VIEWS = ((0.55, 0.35, 1.0), (-0.55, 0.35, -1.0))
 _SIZE = (1280, 640)
@@ -27,7 +29,7 @@ class Picture:
         faces: (F, 3).
         title: the name of the field, beside the colour bar.
         limits: the ends of the colour bar.
-        colormap: a name that matplotlib knows.
+        colormap: one of `ltljax.output.colors.COLORMAPS`.
     """
 
     def __init__(
@@ -50,6 +52,8 @@ class Picture:
             self._plotter = self._compose(pyvista.Plotter, limits, colormap)
 
     def _compose(self, plotter_class: Any, limits: tuple[float, float], colormap: str) -> Any:
+        from matplotlib.colors import LinearSegmentedColormap  # which PyVista brings
+
         plotter = plotter_class(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
         bar = dict(color="black", fmt="%.3g", n_labels=2, position_x=0.3, position_y=0.02, width=0.65, height=0.08)
         for column, view in enumerate(_VIEWS):
@@ -59,7 +63,7 @@ class Picture:
                 self._surface,
                 scalars=self._title,
                 clim=limits,
-                cmap=colormap,
+                cmap=LinearSegmentedColormap.from_list(colormap, colormap_samples(colormap) / 255),
                 smooth_shading=True,
                 interpolate_before_map=True,
                 ambient=0.25,

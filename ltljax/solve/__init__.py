@@ -1,4 +1,5 @@
-"""How it is solved: time stepping through diffrax, the steppers diffrax lacks, linear systems and multigrid."""
+"""How it is solved: time stepping through diffrax, the steppers diffrax lacks, linear systems,
+multigrid, eigenmodes, and what linear theory says before a run."""
 
 from .distance import geodesic_distance
 from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
@@ -7,6 +8,7 @@ from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
 from .restart import RestartError
 from .stabilised import RKL1, RKL2
+from .stability import Dispersion, Explanation, dispersion, explain
 from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
 
 __all__ = [
@@ -16,7 +18,9 @@ __all__ = [
     "TRBDF2",
     "BackwardEuler",
     "CrankNicolson",
+    "Dispersion",
     "Eigenmodes",
+    "Explanation",
     "GrowingModesWarning",
     "IncompatibleSourceWarning",
     "Multigrid",
@@ -24,7 +28,9 @@ __all__ = [
     "Solution",
     "SolveError",
     "Steady",
+    "dispersion",
     "eigenmodes",
+    "explain",
     "geodesic_distance",
     "multigrid",
     "poisson",

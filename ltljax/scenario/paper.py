@@ -1,81 +1,21 @@
-"""The paper's examples as scenarios: names and options become an equation, a mesh and an initial state.
+"""The paper's two examples: `Options` become a `Scenario` with a mesh, an equation and an initial state."""
 
-What enters: a name from `SCENARIOS` and `Options`. What leaves: a `Scenario`, ready to be solved.
-"""
-
-import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
-from .lifting.schemes import Monotone
-from .mesh import Mesh, load_mesh, shapes
-from .operators import integrate
-from .surface import Surface
+from ..equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
+from ..lifting.schemes import Monotone
+from ..mesh import Mesh, load_mesh, shapes
+from ..operators import integrate
+from ..surface import Surface
+from .scenario import Options, Scenario, Settings, scaled_to_unit_area
 
 BUILT_IN = ("sphere", "torus", "disk")
 SOURCES = ("angle", "angle-zero-mean", "sine")
 _MAJOR, _MINOR = 2.0, 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """What a user can choose about a scenario.
-
-    Attributes:
-        mesh: one of `BUILT_IN` or the path of a mesh file.
-        source: of `heat` on the torus, one of `SOURCES`.
-        boundary: of `heat` on an open mesh, conditions as `parse_condition` reads them.
-        as_published: of `turing`, the paper's parameters in place of those that make a pattern.
-        keep_scale: leave a mesh file's length scale alone.
-        repair: mend a mesh file that is not acceptable.
-        seed: of the random numbers.
-        t1: the end of the run; None for the scenario's own.
-    """
-
-    mesh: str = "sphere"
-    source: str | None = None
-    boundary: tuple[str, ...] = ()
-    as_published: bool = False
-    keep_scale: bool = False
-    repair: bool = False
-    seed: int = 0
-    t1: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Scenario:
-    """An example, ready to be solved.
-
-    Attributes:
-        name: its name.
-        mesh: where; for files scaled as ``notes`` says.
-        make_equation: the equation, from the surface of the mesh.
-        u0: the initial state.
-        t1: the end of the run.
-        parameters: every parameter, for the record.
-        species: the names of the state's columns.
-        shown: the column that pictures show.
-        exact: ``t -> state``, where the solution is known.
-        exact_is: what ``exact`` is, in words.
-        notes: what a reader of the results should know.
-    """
-
-    name: str
-    mesh: Mesh
-    make_equation: Callable[[Surface], Equation]
-    u0: np.ndarray
-    t1: float
-    parameters: dict[str, Any]
-    species: tuple[str, ...]
-    shown: int = 0
-    exact: Callable[[float], np.ndarray] | None = None
-    exact_is: str = ""
-    notes: tuple[str, ...] = ()
 
 
 def heat(options: Options) -> Scenario:
@@ -214,6 +154,7 @@ def turing(options: Options) -> Scenario:
         parameters=dict(diffusivity=diffusivity, **reaction, decay_noise=noise, start=start),
         species=("u1", "u2"),
         shown=1,
+        settings=Settings(show="u2"),
         exact=(lambda t: np.broadcast_to([1.0, 16.0], (mesh.num_vertices, 2))) if options.as_published else None,
         exact_is="(1, 16), the state the published parameters tend to" if options.as_published else "",
         notes=note,
@@ -254,8 +195,7 @@ def _from_file(options: Options) -> tuple[Mesh, str]:
     mesh = load_mesh(options.mesh, repair=options.repair).reordered()
     if options.keep_scale:
         return mesh, f"The mesh keeps its scale: area {mesh.area:.6g}."
-    factor = math.sqrt(4 * math.pi / mesh.area)
-    return mesh.scaled(factor), f"The mesh is scaled by {factor:.6g}, so that its area is that of the unit sphere."
+    return scaled_to_unit_area(mesh)
 
 
 def _poloidal_angle(mesh: Mesh) -> np.ndarray:

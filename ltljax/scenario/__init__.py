@@ -1,0 +1,21 @@
+"""What a person wants to run: a name, options or a file become a `Scenario`, ready to be solved."""
+
+from .paper import BUILT_IN, SCENARIOS, SOURCES
+from .reader import ScenarioError
+from .scenario import Options, Scenario, Settings
+from .written import SCHEMES, library, parse_change, read, title
+
+__all__ = [
+    "BUILT_IN",
+    "SCENARIOS",
+    "SCHEMES",
+    "SOURCES",
+    "Options",
+    "Scenario",
+    "ScenarioError",
+    "Settings",
+    "library",
+    "parse_change",
+    "read",
+    "title",
+]

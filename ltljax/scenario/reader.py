@@ -1,0 +1,205 @@
+"""Reads tables of a scenario file: a mistake is named by file, key, what was found and what is allowed."""
+
+import difflib
+import math
+import tomllib
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Any
+
+from ..formulas import Formula, FormulaError, parse
+
+# More than any scenario needs; what is larger is not one.
+_LARGEST_FILE = 1_000_000
+_DEEPEST = 8
+
+
+class ScenarioError(ValueError):
+    """A scenario file that does not say what to do."""
+
+
+def load(text: str, name: str) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Raises:
+        ScenarioError: it is too long, or no TOML.
+    """
+    if len(text) > _LARGEST_FILE:
+        raise ScenarioError(f"{name}: expected at most {_LARGEST_FILE} characters, found {len(text)}.")
+    try:
+        tables = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise ScenarioError(f"{name}: expected TOML, found: {error or 'tables too deep'}.") from None
+    if _depth(tables) > _DEEPEST:
+        raise ScenarioError(f"{name}: expected tables at most {_DEEPEST} deep.")
+    return tables
+
+
+def _depth(value: Any, limit: int = _DEEPEST) -> int:
+    if limit < 0 or not isinstance(value, dict | list) or not value:
+        return 0
+    return 1 + max(_depth(inner, limit - 1) for inner in (value.values() if isinstance(value, dict) else value))
+
+
+class Table:
+    """One table of a scenario file, from which values are taken by name; what is not taken is a mistake.
+
+    Args:
+        values: the table.
+        file: the name of the file, for messages.
+        path: the table's own name, for messages.
+    """
+
+    def __init__(self, values: Any, file: str, path: str = ""):
+        self._file, self._path = file, path
+        if not isinstance(values, dict):
+            raise ScenarioError(f"{file}: expected [{path}] as a table, found {_shown(values)}.")
+        self._values: dict[str, Any] = values
+        self.taken: dict[str, Any] = {}
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def names(self) -> list[str]:
+        """The keys that are left."""
+        return [key for key in self._values if key not in self.taken]
+
+    def error(self, key: str, expected: str) -> ScenarioError:
+        """The mistake that the value of a key is."""
+        return ScenarioError(
+            f"{self._file}: expected {expected} as {self._name(key)}, found {_shown(self._values.get(key))}."
+        )
+
+    def table(self, key: str) -> "Table":
+        """A table inside; empty where there is none."""
+        inner = Table(self._values.get(key, {}), self._file, self._name(key))
+        self.taken[key] = inner.taken
+        return inner
+
+    def number(self, key: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
+        """A finite number."""
+        value = self._values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not _is_within(value, least, most):
+            bounds = f" from {least:g} to {most:g}" if math.isfinite(least + most) else ""
+            bounds = bounds or (f" of at least {least:g}" if math.isfinite(least) else "")
+            raise self.error(key, f"a number{bounds}")
+        return self._take(key, float(value))
+
+    def count(self, key: str, default: int, least: int, most: int) -> int:
+        """A whole number."""
+        value = self._values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            raise self.error(key, f"a whole number from {least} to {most}")
+        return self._take(key, value)
+
+    def flag(self, key: str, default: bool) -> bool:
+        """True or false."""
+        value = self._values.get(key, default)
+        if not isinstance(value, bool):
+            raise self.error(key, "true or false")
+        return self._take(key, value)
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text on one line."""
+        value = self._values.get(key, default)
+        if not isinstance(value, str) or len(value) > 1000 or not value.isprintable():
+            raise self.error(key, "a text")
+        return self._take(key, value)
+
+    def choice(self, key: str, allowed: Collection[str], default: str | None = None) -> str:
+        """One of several words."""
+        value = self._values.get(key, default)
+        if not isinstance(value, str) or value not in allowed:
+            raise self.error(key, f"one of {', '.join(allowed)}{_near(value, allowed)}")
+        return self._take(key, value)
+
+    def formula(self, key: str, names: Iterable[str], default: float | str | None = None) -> Formula:
+        """A number or a formula of the names."""
+        value = self._values.get(key, default)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and _is_within(value)
+        if not (is_number or isinstance(value, str)):
+            raise self.error(key, "a number or a formula")
+        try:
+            found = parse(repr(float(value)) if is_number else value, names)  # type: ignore
+        except FormulaError as error:
+            raise ScenarioError(f"{self._file}: {self._name(key)}: {error}") from None
+        self._take(key, value)
+        return found
+
+    def formulas(self, key: str, count: int, names: Iterable[str]) -> list[Formula]:
+        """A list of so many formulas."""
+        value = self._values.get(key)
+        if not isinstance(value, list) or len(value) != count:
+            raise self.error(key, f"a list of {count} formulas")
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self._name(key))
+        found = [inner.formula(str(index), names) for index in range(count)]
+        self._take(key, value)
+        return found
+
+    def numbers(self, key: str, default: tuple[float, ...], least: float, most: float) -> list[float]:
+        """As many numbers as the default has."""
+        value = self._values.get(key, list(default))
+        if not isinstance(value, list) or len(value) != len(default):
+            raise self.error(key, f"a list of {len(default)} numbers")
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self._name(key))
+        return self._take(key, [inner.number(str(index), 0.0, least, most) for index in range(len(default))])
+
+    def texts(self, key: str) -> list[str]:
+        """A list of texts; empty by default."""
+        value = self._values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(entry, str) for entry in value):
+            raise self.error(key, "a list of texts")
+        return self._take(key, value)
+
+    def file(self, key: str, folder: Path) -> Path:
+        """A file in the folder of the scenario, or below.
+
+        Raises:
+            ScenarioError: it leads out of that folder, or does not exist.
+        """
+        value = self.text(key)
+        inside = folder.resolve()
+        try:
+            path = (inside / value).resolve()
+            is_file = path.is_file()
+        except (OSError, ValueError, RuntimeError):
+            raise self.error(key, "the name of a file") from None
+        if not path.is_relative_to(inside):
+            raise self.error(key, f"a file in the scenario's own folder, {folder}, or below it")
+        if not is_file:
+            raise self.error(key, "the name of a file that exists")
+        return path
+
+    def finish(self) -> None:
+        """Raise where a key was not taken: nobody would notice that it does nothing."""
+        for key in self.names():
+            allowed = sorted(self.taken)
+            raise ScenarioError(
+                f"{self._file}: {self._name(key)} is not known{_near(key, allowed)}. "
+                f"Known here: {', '.join(allowed) or 'nothing'}."
+            )
+
+    def _take(self, key: str, value: Any) -> Any:
+        self.taken[key] = value
+        return value
+
+    def _name(self, key: str) -> str:
+        return f"{self._path}.{key}" if self._path else key
+
+
+def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -> bool:
+    try:
+        number = float(value)
+    except OverflowError:
+        return False
+    return math.isfinite(number) and least <= number <= most
+
+
+def _shown(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) < 80 else text[:77] + "..."
+
+
+def _near(value: Any, allowed: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(value)[:100], list(allowed), n=1)
+    return f" (did you mean {near[0]}?)" if near else ""

@@ -1,0 +1,389 @@
+"""A scenario file becomes a `Scenario`: mesh, equation, initial state, time, solver and outputs.
+
+What enters: a TOML text, the folder whose files it may name, and what the command line sets. What leaves: a `Scenario`
+whose ``resolved`` table holds every value, defaults too.
+"""
+
+import functools
+import inspect
+import math
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..elliptic import direction_tensor, elliptic_stencil
+from ..equations import CahnHilliard, Equation, ReactionDiffusion, kinetics
+from ..formulas import Formula
+from ..mesh import Mesh, load_mesh, shapes
+from ..output.colors import COLORMAPS
+from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson
+from ..surface import Surface
+from .paper import parse_condition
+from .reader import ScenarioError, Table, load
+from .scenario import Scenario, Settings, scaled_to_unit_area
+
+# Where nothing else is said every formula knows these: positions, a random number for each vertex between -1 and 1, and
+# random bumps of height one.
+PLACES = ("x", "y", "z", "noise", "bumps")
+KINETICS: dict[str, Callable[..., kinetics.Kinetics]] = {
+    name.replace("_", "-"): getattr(kinetics, name) for name in kinetics.__all__ if name.islower()
+}
+SOLVERS = {
+    "RKL2": RKL2, "RKL1": RKL1, "Tsit5": diffrax.Tsit5, "TRBDF2": TRBDF2, "BackwardEuler": BackwardEuler,
+    "CrankNicolson": CrankNicolson, "SBDF2": SBDF2, "KenCarp3": diffrax.KenCarp3, "KenCarp4": diffrax.KenCarp4,
+    "Kvaerno5": diffrax.Kvaerno5,
+}  # fmt: skip
+SCHEMES = ("monotone", "polynomial", "paper")
+_SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
+    "sphere": (shapes.icosphere, {"subdivisions": (5, 8)}),
+    "ellipsoid": (shapes.ellipsoid, {"subdivisions": (5, 8)}),
+    "torus": (shapes.torus, {"n_major": (144, 2000), "n_minor": (72, 2000)}),
+    "disk": (shapes.disk, {"rings": (60, 500)}),
+    "hemisphere": (shapes.hemisphere, {"rings": (50, 500)}),
+    "square": (shapes.square, {"n": (100, 1500)}),
+    "cylinder": (shapes.cylinder, {"n_around": (120, 2000), "n_along": (80, 2000)}),
+}
+# States of more bytes than this are not kept without being asked twice.
+_MOST_BYTES = 8e9
+
+
+def library() -> dict[str, str]:
+    """The texts of the scenarios that come with the package, by name."""
+    folder = files("ltljax.scenario") / "library"
+    found = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
+    return {name: found[name].read_text(encoding="utf-8") for name in sorted(found)}
+
+
+def title(text: str) -> str:
+    """The title of a scenario of the library."""
+    return str(load(text, "library")["title"])
+
+
+def parse_change(text: str) -> tuple[str, Any]:
+    """Key and value of a change such as ``kinetics.feed=0.05``; what is no TOML value counts as a text.
+
+    Raises:
+        ScenarioError: there is no key, or no value.
+    """
+    key, _, value = (part.strip() for part in text.partition("="))
+    if not value or not all(part.isidentifier() for part in key.split(".")):
+        raise ScenarioError(f"Expected --set KEY=VALUE, such as kinetics.feed=0.05, found {text!r}.")
+    try:
+        return key, load(f"value = {value}", "--set")["value"]
+    except ScenarioError:
+        return key, value
+
+
+def read(
+    text: str, name: str, folder: Path, changes: dict[str, Any] | None = None, mesh_file: Path | None = None
+) -> Scenario:
+    """The scenario that a text describes.
+
+    Args:
+        text: TOML.
+        name: of the file or scenario, for messages.
+        folder: the only one whose files the text may name.
+        changes: values by dotted key that replace those of the text, as ``{"kinetics.feed": 0.05}``.
+        mesh_file: a mesh file from anywhere, in place of the text's mesh.
+
+    Raises:
+        ScenarioError: the text has a mistake; its file, key, what was found and what is allowed are named.
+    """
+    tables = load(text, name)
+    for key, value in (changes or {}).items():
+        _set(tables, key, value, name)
+    if mesh_file is not None:
+        kept = {key: value for key, value in tables.get("mesh", {}).items() if key in ("scale", "repair")}
+        tables["mesh"] = kept | {"file": mesh_file.name}
+        folder = mesh_file.parent
+    root = Table(tables, name)
+    title = root.text("title", Path(name).stem)
+    seed = root.count("seed", 0, 0, 2**63 - 1)
+    mesh, used, note = _mesh(root.table("mesh"), folder)
+    place = _places(root.table("bumps"), mesh, seed)
+    make_equation, species = _equation(root, mesh, place)
+    start, start_file = _start(root.table("initial"), mesh, place, species, folder)
+    settings = _settings(root, species)
+    time = root.table("time")
+    end = time.number("end", 10.0, least=1e-300)
+    frames = time.count("frames", 60, 1, 10_000)
+    time.finish()
+    root.finish()
+    if (size := (frames + 1) * start.nbytes) > _MOST_BYTES:
+        raise ScenarioError(
+            f"{name}: {frames} frames of {mesh.num_vertices} vertices would take {size / 1e9:.0f} GB of memory. "
+            "Expected at most 8 GB: ask for fewer frames, or a coarser mesh."
+        )
+    return Scenario(
+        name=_plain(Path(name).stem),
+        mesh=mesh,
+        make_equation=make_equation,
+        u0=start,
+        t1=end,
+        parameters=root.taken,
+        species=species,
+        shown=species.index(settings.show),
+        notes=note,
+        title=title,
+        frames=frames,
+        settings=settings,
+        resolved=root.taken,
+        files=tuple(path for path in (used, start_file) if path is not None),
+    )
+
+
+def _set(tables: dict[str, Any], key: str, value: Any, name: str) -> None:
+    *path, last = key.split(".")
+    inner: Any = tables
+    for part in path:
+        inner = inner.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise ScenarioError(f"{name}: {key} cannot be set: {part} is no table.")
+    inner[last] = value
+
+
+def _plain(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)[:60] or "scenario"
+
+
+def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...]]:
+    if "file" in table:
+        path = table.file("file", folder)
+        repair = table.flag("repair", False)
+        scale = table.choice("scale", ("unit", "keep"), "unit")
+        table.finish()
+        mesh = load_mesh(path, repair=repair).reordered()
+        if scale == "keep":
+            return mesh, path, (f"The mesh keeps its scale: area {mesh.area:.6g}.",)
+        mesh, note = scaled_to_unit_area(mesh)
+        return mesh, path, (note,)
+    shape = table.choice("shape", tuple(_SHAPES), "sphere")
+    make, counts = _SHAPES[shape]
+    arguments: dict[str, Any] = {
+        key: table.count(key, default, 0 if key == "subdivisions" else 3, most)
+        for key, (default, most) in counts.items()
+    }
+    for key, parameter in inspect.signature(make).parameters.items():
+        if key == "axes":
+            arguments[key] = tuple(table.numbers(key, (2.0, 1.0, 1.5), 1e-3, 1e3))
+        elif key not in counts:
+            arguments[key] = table.number(key, float(parameter.default), 1e-3, 1e3)
+    table.finish()
+    return make(**arguments), None, ()
+
+
+def _places(table: Table, mesh: Mesh, seed: int) -> Callable[[Formula, str], np.ndarray]:
+    """What evaluates a formula at every vertex; random numbers differ from key to key, and not with the order."""
+    count = table.count("count", 12, 1, 10_000)
+    radius = table.number("radius", 0.1, 1e-6, 1e6)
+    table.finish()
+    order, size = mesh.source_order, mesh.num_vertices
+
+    @functools.cache
+    def bumps() -> np.ndarray:
+        centres = mesh.vertices[order[np.random.default_rng(seed).integers(size, size=count)]]
+        height = np.zeros(size)
+        for centre in centres:
+            squared = ((mesh.vertices - centre) ** 2).sum(axis=1)
+            height = np.maximum(height, np.exp(-squared / radius**2))
+        return height
+
+    def evaluate(formula: Formula, key: str) -> np.ndarray:
+        values = dict(zip("xyz", mesh.vertices.T, strict=True))
+        if "noise" in formula.names:
+            values["noise"] = np.empty(size)
+            values["noise"][order] = np.random.default_rng([seed, *key.encode()]).uniform(-1, 1, size)
+        if "bumps" in formula.names:
+            values["bumps"] = bumps()
+        known = {name: jnp.asarray(values[name], jnp.result_type(float)) for name in formula.names}
+        return np.broadcast_to(np.asarray(formula(**known), np.float64), size)
+
+    return evaluate
+
+
+def _finite(values: np.ndarray, table: Table, key: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        raise table.error(key, "a formula that is finite at every vertex")
+    return values
+
+
+class _Written(eqx.Module):
+    """Rates that were written as formulas of species and parameters."""
+
+    formulas: tuple[Formula, ...] = eqx.field(static=True)
+    species: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, u, params):
+        known = dict(zip(self.species, u, strict=True)) | params
+        return tuple(jnp.broadcast_to(f(**{name: known[name] for name in f.names}), u[0].shape) for f in self.formulas)
+
+
+def _named_reaction(table: Table, place) -> tuple[Callable[[Any], kinetics.Kinetics], tuple[str, ...]]:
+    make = KINETICS[table.taken["name"]]
+    values = {key: _field(table, key, place, one.default) for key, one in inspect.signature(make).parameters.items()}
+    table.finish()
+    return lambda dtype: make(**{key: jnp.asarray(value, dtype) for key, value in values.items()}), make().species
+
+
+def _written_reaction(
+    table: Table, parameters: Table, place
+) -> tuple[Callable[[Any], kinetics.Kinetics], tuple[str, ...]]:
+    rates, names = table.names(), parameters.names()
+    for key in rates:
+        if not (key.startswith("d") and key[1:].isidentifier()):
+            raise table.error(key, "the rate of a species, such as du or dv,")
+    species = tuple(key[1:] for key in rates)
+    for name in names:
+        if name in species or not name.isidentifier():
+            raise parameters.error(name, "a name that is no species'")
+    written = _Written(tuple(table.formula(key, (*species, *names)) for key in rates), species)
+    values = {name: _field(parameters, name, place) for name in names}
+
+    def reaction(dtype):
+        return kinetics.Kinetics(written, {name: jnp.asarray(value, dtype) for name, value in values.items()}, species)
+
+    return reaction, species
+
+
+def _cahn_hilliard(table: Table) -> Callable[[Surface], Equation]:
+    width, mobility = table.number("width", 0.05, 1e-6, 1e3), table.number("mobility", 1.0, 0, 1e6)
+    table.finish()
+    return lambda surface: CahnHilliard(jnp.asarray(width, surface.dtype), jnp.asarray(mobility, surface.dtype))
+
+
+def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[[Surface], Equation], tuple[str, ...]]:
+    table, reactions = root.table("kinetics"), root.table("reactions")
+    if reactions.names():
+        if table.names():
+            raise root.error("kinetics", "either [kinetics] with a name or [reactions] with formulas, not both,")
+        reaction, species = _written_reaction(reactions, root.table("parameters"), place)
+    elif table.choice("name", (*KINETICS, "cahn-hilliard")) == "cahn-hilliard":
+        return _cahn_hilliard(table), ("u",)
+    else:
+        reaction, species = _named_reaction(table, place)
+    diffusion = root.table("diffusivity")
+    spreads = [_field(diffusion, s, place, 0.0) for s in species]
+    for s, spread in zip(species, spreads, strict=True):
+        if (np.asarray(spread) < 0).any():
+            raise diffusion.error(s, "a diffusivity that is not negative")
+    diffusion.finish()
+    direction, flow = _direction(root.table("direction"), place, species), _flow(root.table("flow"), place)
+    boundary = root.table("boundary")
+    conditions = tuple(parse_condition(text) for text in boundary.texts("conditions")) if boundary.names() else ()
+    boundary.finish()
+    loops = [condition.where if isinstance(condition.where, int) else 0 for condition in conditions]
+    if any(loop >= len(mesh.boundary_loops) for loop in loops):
+        raise boundary.error("conditions", f"conditions for a mesh with {len(mesh.boundary_loops)} boundary loops")
+
+    def make_equation(surface: Surface) -> Equation:
+        spread = [
+            _operator(surface, d, direction if direction and s in direction[2] else None, flow)
+            for s, d in zip(species, spreads, strict=True)
+        ]
+        return ReactionDiffusion(spread, reaction(surface.dtype), boundary=conditions)
+
+    return make_equation, species
+
+
+def _field(table: Table, key: str, place, default: Any = None) -> np.ndarray | float:
+    """A number, or the values of a formula at every vertex."""
+    if default is inspect.Parameter.empty:
+        default = None
+    formula = table.formula(key, PLACES, default)
+    if not formula.names:
+        value = float(formula())
+        if not math.isfinite(value):
+            raise table.error(key, "a finite number")
+        return value
+    return _finite(place(formula, key), table, key)
+
+
+def _direction(table: Table, place, species: tuple[str, ...]) -> tuple[np.ndarray, float, tuple[str, ...]] | None:
+    """The field along which species diffuse faster, how much, and which do."""
+    if not table.names():
+        return None
+    field = _vectors(table, "field", place)
+    ratio = table.number("ratio", 4.0, 1e-3, 1e3)
+    # With all species alike a pattern would be stretched, and keep no direction.
+    which = tuple(table.texts("species")) or species[:1]
+    if unknown := [s for s in which if s not in species]:
+        raise table.error("species", f"some of {', '.join(species)} without {unknown[0]!r}")
+    table.finish()
+    return field, ratio, which
+
+
+def _flow(table: Table, place) -> np.ndarray | None:
+    if not table.names():
+        return None
+    velocity = _vectors(table, "velocity", place)
+    table.finish()
+    return velocity
+
+
+def _vectors(table: Table, key: str, place) -> np.ndarray:
+    """The vectors (V, 3) of three formulas."""
+    parts = [
+        place(formula, f"{key}.{axis}") for formula, axis in zip(table.formulas(key, 3, PLACES), "xyz", strict=True)
+    ]
+    return _finite(np.stack(parts, axis=-1), table, key)
+
+
+def _operator(surface: Surface, diffusivity, direction, flow) -> Any:
+    """How one species spreads: as little as its diffusivity, direction and flow ask for."""
+    if direction is None and flow is None:
+        return diffusivity
+    tensors: Any = np.asarray(diffusivity)
+    if direction is not None:
+        field, ratio, _ = direction
+        # The mean of both directions is the diffusivity, so that the pattern's scale stays.
+        across = 2 / (1 + ratio)
+        tensors = np.asarray(direction_tensor(surface, field, ratio * across, across)) * tensors.reshape(-1, 1, 1)
+    return elliptic_stencil(surface, tensors, None if flow is None else -flow)
+
+
+def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Path) -> tuple[np.ndarray, Path | None]:
+    """The initial state (V, S), from formulas or from a file of arrays in the order of the mesh file."""
+    if "file" not in table:
+        columns = [np.broadcast_to(_field(table, s, place), mesh.num_vertices) for s in species]
+        table.finish()
+        return np.stack(columns, axis=1), None
+    path = table.file("file", folder)
+    table.finish()
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            columns = [np.asarray(arrays[s], np.float64) for s in species]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise table.error("file", f"an .npz file with arrays {', '.join(species)} ({error})") from None
+    state = np.empty((mesh.num_vertices, len(species)))
+    for s, column in zip(species, columns, strict=True):
+        if column.shape != (mesh.num_vertices,) or not np.isfinite(column).all():
+            raise table.error("file", f"finite values of shape ({mesh.num_vertices},) for {s}")
+    state[mesh.source_order] = np.stack(columns, axis=1)
+    return state, path
+
+
+def _settings(root: Table, species: tuple[str, ...]) -> Settings:
+    solver, output = root.table("solver"), root.table("output")
+    name = solver.choice("name", tuple(SOLVERS), "RKL2")
+    dt = solver.number("dt", 0.0, least=0.0)
+    if name == "SBDF2" and not dt:
+        raise solver.error("dt", "the length of steps, which SBDF2 needs,")
+    settings = Settings(
+        scheme=solver.choice("scheme", SCHEMES, "monotone"),
+        dtype=solver.choice("dtype", ("float32", "float64"), "float64"),
+        solver=None if name == "RKL2" else SOLVERS[name](),
+        rtol=solver.number("rtol", 1e-4, 1e-14, 1e-1),
+        atol=solver.number("atol", 1e-6, 1e-16, 1.0),
+        dt=dt or None,
+        show=output.choice("show", species, species[0]),
+        colormap=output.choice("colormap", tuple(COLORMAPS), "viridis"),
+    )
+    solver.finish()
+    output.finish()
+    return settings

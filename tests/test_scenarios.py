@@ -1,0 +1,211 @@
+"""A scenario file says everything, runs as it says, and a mistake in it is one line that names file, key and cause."""
+
+import tomllib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import ltljax as ltl
+from ltljax import scenario
+from ltljax.cli import main
+from ltljax.scenario.written import KINETICS
+
+PLAIN = """
+[mesh]
+shape = "sphere"
+subdivisions = 2
+[kinetics]
+name = "schnakenberg"
+rate = 30.0
+[diffusivity]
+u = 1.0
+v = 10.0
+[initial]
+u = "1 + 0.1*noise"
+v = 0.9
+[time]
+end = 0.1
+frames = 2
+"""
+
+
+@pytest.mark.parametrize("name", scenario.library())
+def test_every_scenario_of_the_library_can_be_read_and_its_state_changes(name, tmp_path):
+    text = scenario.library()[name]
+    coarse = {} if "torus" in text else {"mesh.subdivisions": 2}
+    example = scenario.read(text, name, tmp_path, coarse)
+    surface = ltl.Surface.from_mesh(example.mesh)
+    equation = example.make_equation(surface)
+    rate = equation.rate(jnp.array(0.0), surface, jnp.asarray(example.u0))
+    assert rate.shape == example.u0.shape == (surface.num_vertices, len(example.species))
+    assert np.isfinite(rate).all()
+    assert float(jnp.abs(rate).max()) > 0
+
+
+def test_the_library_shows_every_kinetics():
+    names = {tomllib.loads(text).get("kinetics", {}).get("name") for text in scenario.library().values()}
+    # Turk's is the scenario turing.
+    assert set(KINETICS) - names == {"turk"}
+    assert "cahn-hilliard" in names
+
+
+def test_a_written_reaction_is_the_named_one(tmp_path):
+    named = scenario.read(PLAIN, "named", tmp_path)
+    text = PLAIN.replace(
+        '[kinetics]\nname = "schnakenberg"\nrate = 30.0',
+        """
+[reactions]
+du = "rate*(a - u + u^2*v)"
+dv = "rate*(b - u^2*v)"
+[parameters]
+a = 0.1
+b = "0.9 + 0*x"
+rate = 30""",
+    )
+    written = scenario.read(text, "written", tmp_path)
+    surface = ltl.Surface.from_mesh(named.mesh)
+    u = jnp.asarray(named.u0)
+    np.testing.assert_array_equal(named.u0, written.u0)
+    rates = [example.make_equation(surface).rate(jnp.array(0.0), surface, u) for example in (named, written)]
+    np.testing.assert_allclose(*rates, rtol=1e-9, atol=1e-9)
+
+
+def test_directions_and_flows_become_operators(tmp_path):
+    text = PLAIN + '[direction]\nfield = ["-y", "x", "0"]\nspecies = ["u"]\n[flow]\nvelocity = ["-y", "x", 0]\n'
+    equation = scenario.read(text, "flowing", tmp_path)
+    surface = ltl.Surface.from_mesh(equation.mesh)
+    spreads = equation.make_equation(surface).diffusivity
+    assert all(isinstance(spread, ltl.EllipticStencil) for spread in spreads)
+
+
+def test_a_resolved_scenario_gives_the_same_numbers_again(tmp_path):
+    (tmp_path / "mine").mkdir()
+    ball = ltl.shapes.random_sphere(200, seed=0)
+    trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(tmp_path / "mine" / "ball.obj")
+    text = PLAIN.replace('shape = "sphere"\nsubdivisions = 2', 'file = "ball.obj"')
+    (tmp_path / "mine" / "my.toml").write_text(text)
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(["run", str(tmp_path / "mine/my.toml"), "--out", str(first), "--set", "kinetics.a=0.12"]) == 0
+    assert main(["run", str(first / "scenario.toml"), "--out", str(second)]) == 0
+    states = first / "series/my_0002.vtp", second / "series/scenario_0002.vtp"
+    assert states[0].read_bytes() == states[1].read_bytes()
+    assert tomllib.loads((first / "scenario.toml").read_text())["kinetics"]["a"] == 0.12
+
+
+def test_states_come_from_a_file_beside_the_scenario(tmp_path):
+    state = {name: np.random.default_rng(0).random(162) for name in "uv"}
+    np.savez(tmp_path / "start.npz", **state)
+    text = PLAIN.replace('u = "1 + 0.1*noise"\nv = 0.9', 'file = "start.npz"')
+    found = scenario.read(text, "mine", tmp_path)
+    np.testing.assert_array_equal(found.u0[found.mesh.source_order], np.stack([state["u"], state["v"]], axis=1))
+
+
+def changed(old, new):
+    assert old in PLAIN
+    return PLAIN.replace(old, new)
+
+
+BROKEN = {
+    "no TOML": ("[mesh", "expected TOML"),
+    "nothing": ("", "as kinetics.name, found nothing"),
+    "unknown table": (PLAIN + "[mehs]\nshape = 1\n", "mehs is not known (did you mean mesh?)"),
+    "unknown key": (changed("end = 0.1", "end = 0.1\nfrmaes = 3"), "time.frmaes is not known (did you mean frames?)"),
+    "unknown kinetics": (changed('"schnakenberg"', '"schnackenberg"'), "did you mean schnakenberg?"),
+    "unknown parameter": (changed("rate = 30.0", "rtae = 30.0"), "kinetics.rtae is not known (did you mean rate?)"),
+    "table as value": ("mesh = 3" + PLAIN.replace("[mesh]", "[other]"), "expected [mesh] as a table"),
+    "text as number": (changed("end = 0.1", 'end = "soon"'), "time.end"),
+    "boolean as number": (changed("end = 0.1", "end = true"), "time.end"),
+    "negative time": (changed("end = 0.1", "end = -1"), "time.end"),
+    "infinite time": (changed("end = 0.1", "end = inf"), "time.end"),
+    "NaN": (changed("end = 0.1", "end = nan"), "time.end"),
+    "huge integer": (changed("end = 0.1", "end = 1" + "0" * 400), "time.end"),
+    "NaN parameter": (changed("rate = 30.0", "rate = nan"), "kinetics.rate"),
+    "no frames": (changed("frames = 2", "frames = 0"), "time.frames"),
+    "too many frames": (changed("frames = 2", "frames = 1000000000"), "time.frames"),
+    "fraction of a frame": (changed("frames = 2", "frames = 2.5"), "time.frames"),
+    "memory": (changed("subdivisions = 2", "subdivisions = 8").replace("frames = 2", "frames = 5000"), "GB of memory"),
+    "too fine": (changed("subdivisions = 2", "subdivisions = 30"), "mesh.subdivisions"),
+    "unknown shape": (changed('"sphere"', '"cube"'), "mesh.shape"),
+    "wrong number of a shape": (changed("subdivisions = 2", "radius = -1"), "mesh.radius"),
+    "key of another shape": (changed("subdivisions = 2", "rings = 3"), "mesh.rings is not known"),
+    "code": (changed('"1 + 0.1*noise"', "\"__import__('os').system('touch hacked')\""), "expected a function"),
+    "attribute": (changed('"1 + 0.1*noise"', '"x.__class__"'), "found '.'"),
+    "call of a call": (changed('"1 + 0.1*noise"', '"sin(x)(y)"'), "found '('"),
+    "name of nothing": (changed('"1 + 0.1*noise"', '"1 + w"'), "found 'w'"),
+    "cycle": (changed("rate = 30.0", 'a = "b"\nb = "a"'), "found 'b'"),
+    "species in a parameter": (changed("rate = 30.0", 'rate = "u"'), "found 'u'"),
+    "not finite": (changed('"1 + 0.1*noise"', '"log(x)"'), "finite at every vertex"),
+    "huge exponent": (changed('"1 + 0.1*noise"', '"9^9^9^9"'), "a finite number"),
+    "deep": (changed('"1 + 0.1*noise"', '"' + "(" * 300 + '1"'), "at most 60 levels"),
+    "long": (changed('"1 + 0.1*noise"', '"' + "1+" * 3000 + '1"'), "at most 2000 characters"),
+    "formula of a list": (changed('"1 + 0.1*noise"', "[1, 2]"), "a number or a formula"),
+    "no start": (changed("v = 0.9\n", ""), "initial.v, found nothing"),
+    "path upwards": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "../secret.obj"'), "own folder"),
+    "absolute path": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "/etc/passwd"'), "own folder"),
+    "path through a link": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "link.obj"'), "own folder"),
+    "no such file": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "none.obj"'), "a file that exists"),
+    "null in a path": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "a\\u0000b"'), "mesh.file"),
+    "folder as file": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "."'), "a file that exists"),
+    "state out of the folder": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "../start.npz"'), "own folder"),
+    "state that is no state": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "bad.npz"'), "an .npz file"),
+    "pickle": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "pickle.npz"'), "an .npz file"),
+    "negative diffusivity": (changed("u = 1.0", "u = -1.0"), "a diffusivity that is not negative"),
+    "negative somewhere": (changed("u = 1.0", 'u = "x"'), "a diffusivity that is not negative"),
+    "diffusivity of nobody": (changed("v = 10.0", "v = 10.0\nw = 3"), "diffusivity.w is not known"),
+    "boundary of a sphere": (PLAIN + '[boundary]\nconditions = ["dirichlet=0"]\n', "boundary.conditions"),
+    "no condition": (PLAIN + '[boundary]\nconditions = ["fixed=0"]\n', "found 'fixed=0'"),
+    "unknown solver": (PLAIN + '[solver]\nname = "Magic"\n', "solver.name"),
+    "solver without its step": (PLAIN + '[solver]\nname = "SBDF2"\n', "solver.dt"),
+    "unknown species shown": (PLAIN + '[output]\nshow = "w"\n', "output.show"),
+    "two reactions": (PLAIN + '[reactions]\ndu = "1"\n', "not both"),
+    "short direction": (PLAIN + '[direction]\nfield = ["1", "2"]\n', "a list of 3 formulas"),
+    "direction of nobody": (PLAIN + '[direction]\nfield = [1, 0, 0]\nspecies = ["w"]\n', "direction.species"),
+    "deep tables": ("x = " + "[" * 5000 + "]" * 5000 + PLAIN, "expected"),
+    "too long": ("# " + "x" * 2_000_000 + PLAIN, "characters"),
+    "title of lines": ('title = "a\\nb"' + PLAIN, "title"),
+    "negative seed": ("seed = -1" + PLAIN, "seed"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_or_malicious_file_is_one_clear_line(name, tmp_path, capsys, monkeypatch):
+    text, says = BROKEN[name]
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    (tmp_path / "secret.obj").write_text("v 0 0 0\n")
+    (inside / "link.obj").symlink_to(tmp_path / "secret.obj")
+    (inside / "bad.npz").write_text("no zip")
+    np.savez(inside / "pickle.npz", u=np.array([{}], object), v=np.zeros(3))
+    (inside / "my.toml").write_text(text)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["run", "my.toml", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert "my.toml" in said.err or "fixed=0" in said.err
+    assert says in said.err
+    assert len(said.err) < 700
+    # Nothing was executed, and nothing written.
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_changes_on_the_command_line_are_checked_like_the_file(tmp_path, capsys):
+    assert main(["run", "gray-scott", "--set", "kinetics.fed=1", "--out", str(tmp_path)]) == 2
+    assert "did you mean feed" in capsys.readouterr().err
+    assert main(["run", "gray-scott", "--set", "feed", "--out", str(tmp_path)]) == 2
+    assert "KEY=VALUE" in capsys.readouterr().err
+    assert main(["run", "turing", "--set", "a.b=1", "--out", str(tmp_path)]) == 2
+    assert "--set is for scenario files" in capsys.readouterr().err
+    assert main(["run", "gray-scott", "--as-published", "--out", str(tmp_path)]) == 2
+    assert "heat and turing" in capsys.readouterr().err
+
+
+def test_new_prints_a_file_that_runs(tmp_path, capsys):
+    assert main(["new", "two-scales"]) == 0
+    (tmp_path / "my.toml").write_text(capsys.readouterr().out)
+    arguments = ["--set", "mesh.subdivisions=2", "--t1", "0.01", "--frames", "1", "--out", str(tmp_path / "out")]
+    assert main(["run", str(tmp_path / "my.toml"), *arguments]) == 0
+    assert (tmp_path / "out" / "scenario.toml").exists()

@@ -1,0 +1,168 @@
+"""The viewer: what its page holds, and what a browser makes of it."""
+
+import base64
+import json
+import re
+import shutil
+import zlib
+
+import numpy as np
+import pytest
+
+import ltljax as ltl
+from ltljax.output.viewer import Inline, viewer_html, write_viewer
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return ltl.shapes.icosphere(3)
+
+
+def states(mesh, count=5):
+    x, y, z = mesh.vertices.T
+    u = np.stack([np.sin(4 * x + k) for k in range(count)])
+    return np.linspace(0, 2, count), {"u": u, "v": np.stack([y * z * k for k in range(count)])}
+
+
+def part(page, name):
+    found = re.search(rf'<script id="{name}"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert found, name
+    return found[1]
+
+
+def unpacked(page, index):
+    """The states of a species, by the layout the page documents."""
+    header = json.loads(part(page, "header"))
+    data = np.frombuffer(zlib.decompress(base64.b64decode(part(page, f"field-{index}"))), np.uint8)
+    low, high = data.reshape(2, len(header["times"]), header["vertices"]).astype(np.uint16)
+    whole = np.cumsum(low + (high << 8), axis=0, dtype=np.uint16)
+    limits = header["species"][index]
+    values = limits["low"] + (limits["high"] - limits["low"]) * whole / 65534
+    return np.where(whole == 65535, np.nan, values)
+
+
+def test_states_are_stored_to_sixteen_bits_and_gaps_stay_gaps(sphere):
+    times, fields = states(sphere)
+    fields["u"][1, 3] = np.nan
+    fields["v"][2, 0] = np.inf
+    page = viewer_html(sphere.vertices, sphere.faces, times, fields)
+    for index, values in enumerate(fields.values()):
+        kept = unpacked(page, index)
+        is_finite = np.isfinite(values)
+        np.testing.assert_array_equal(np.isnan(kept), ~is_finite)
+        assert np.abs(kept - values)[is_finite].max() <= np.ptp(values[is_finite]) / 65534
+
+
+def test_a_uniform_state_and_one_time_are_enough(sphere):
+    page = viewer_html(sphere.vertices, sphere.faces, [0.0], {"u": np.full((1, sphere.num_vertices), 3.0)})
+    np.testing.assert_allclose(unpacked(page, 0), 3.0)
+
+
+def test_a_title_cannot_end_the_script_it_stands_in(sphere):
+    times, fields = states(sphere)
+    title = "</script><script>alert(1)</script>"
+    page = viewer_html(sphere.vertices, sphere.faces, times, fields, title)
+    assert title not in page
+    assert json.loads(part(page, "header"))["title"] == title
+
+
+def test_mistakes_are_named(sphere):
+    times, fields = states(sphere)
+    with pytest.raises(ValueError, match="at least one species"):
+        viewer_html(sphere.vertices, sphere.faces, times, {})
+    with pytest.raises(ValueError, match=r"Expected u of shape \(5, 642\), found \(4, 642\)"):
+        viewer_html(sphere.vertices, sphere.faces, times, {"u": fields["u"][:4]})
+    with pytest.raises(ValueError, match="did you mean viridis"):
+        viewer_html(sphere.vertices, sphere.faces, times, fields, colormap="virdis")
+
+
+def test_it_shows_inside_a_notebook(sphere):
+    times, fields = states(sphere)
+    shown = Inline(viewer_html(sphere.vertices, sphere.faces, times, fields))._repr_html_()
+    assert shown.startswith("<iframe srcdoc=")
+    assert '"viridis"' not in shown.split("srcdoc=")[1].split("style")[0].replace("&quot;", "")
+
+
+def test_a_long_run_on_a_fine_mesh_stays_small():
+    mesh = ltl.shapes.icosphere(6)
+    x, y, _ = mesh.vertices.T
+    # Waves that grow and move, with the noise of a real run in their last digits.
+    noise = np.random.default_rng(0).normal(size=mesh.num_vertices)
+    u = np.stack([np.sin(20 * x + k / 9) * np.cos(17 * y) * np.tanh(k / 30) + 1e-4 * noise for k in range(100)])
+    page = viewer_html(mesh.vertices, mesh.faces, np.arange(100.0), {"u": u})
+    assert len(page) < 15e6
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    driver = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with driver.sync_playwright() as playwright:
+        arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield found
+        found.close()
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+def test_a_browser_shows_plays_and_answers(browser, sphere, tmp_path, size):
+    times, fields = states(sphere)
+    path = tmp_path / "run.html"
+    write_viewer(path, sphere.vertices, sphere.faces, times, fields, "Waves on a sphere")
+    page = browser.new_page(viewport=dict(width=size[0], height=size[1]))
+    said = []
+    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(path.as_uri())
+    page.wait_for_function("window.viewerReady === true", timeout=60_000)
+
+    def picture(name):
+        page.wait_for_timeout(300)
+        page.screenshot(path=tmp_path / f"{name}.png")
+        return page.locator("#scene").screenshot()
+
+    assert page.title() == "Waves on a sphere"
+    last = picture("last")
+    page.locator("#slider").fill("0")
+    assert page.evaluate("viewer.frame") == 0
+    assert page.locator("#time").inner_text() == "t = 0"
+    first = picture("first")
+    assert first != last
+    page.locator("#species").select_option("v")
+    second = picture("species")
+    assert second != first
+    page.evaluate("viewer.setFrame(4)")
+    page.locator("#colormap").select_option("gray")
+    assert picture("gray") != last
+
+    # The value under the pointer is that of the nearest vertex, nearly, and stored as it was given.
+    box = page.locator("#scene").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    found = page.evaluate("([x, y]) => viewer.valueAt(x, y)", list(middle))
+    assert found["value"] == pytest.approx(fields["v"][4][found["vertex"]], abs=0.3)
+    stored = page.evaluate("vertex => viewer.stored(1, 4, vertex)", found["vertex"])
+    assert stored == pytest.approx(fields["v"][4][found["vertex"]], abs=np.ptp(fields["v"]) / 65534)
+    page.mouse.move(*middle)
+    page.wait_for_function("!document.getElementById('value').hidden")
+    assert page.locator("#value").inner_text().startswith("v = ")
+    assert page.evaluate("viewer.valueAt(3, 90)") is None
+
+    # Turning, playing, keys, and a picture to save.
+    page.mouse.down()
+    page.mouse.move(middle[0] + 90, middle[1] + 30)
+    page.mouse.up()
+    assert picture("turned") != second
+    page.evaluate("viewer.setFrame(0)")
+    page.locator("#play").click()
+    page.wait_for_function("viewer.frame > 0.05")
+    page.keyboard.press("ArrowRight")
+    assert not page.evaluate("viewer.playing")
+    assert page.evaluate("viewer.frame") == int(page.evaluate("viewer.frame"))
+    with page.expect_download() as saved:
+        page.locator("#save").click()
+    assert saved.value.suggested_filename == "Waves-on-a-sphere.png"
+    assert said == []
+    page.close()
