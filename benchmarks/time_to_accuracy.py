@@ -92,7 +92,7 @@ PROBLEMS = dict(heat=heat, schnakenberg=schnakenberg)
 LARGEST = dict(heat=160_000, schnakenberg=40_000)
 
 ADAPTIVE = {
-    "RKL2 (the default)": ltl.RKL2(),
+    "RKL2": ltl.RKL2(),
     "Tsit5": diffrax.Tsit5(),
     "TRBDF2": ltl.TRBDF2(),
     "Kvaerno5": diffrax.Kvaerno5(),
@@ -274,14 +274,25 @@ def draw(found, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(found), figsize=(6 * len(found), 5), squeeze=False)
-    for axis, ((name, size), rows) in zip(axes[0], found.items(), strict=True):
-        for label, points in rows.items():
+    columns = 3
+    rows = len(found) // columns + 1
+    figure, axes = plt.subplots(rows, columns, figsize=(4.6 * columns, 4 * rows), squeeze=False)
+    labels = list(dict.fromkeys(label for contestants in found.values() for label in contestants))
+    colors = dict(zip(labels, plt.get_cmap("tab20").colors[::2] + plt.get_cmap("tab20").colors[1::2], strict=False))
+    for axis, ((name, size), contestants) in zip(axes.flat, found.items(), strict=False):
+        for label, points in contestants.items():
             style = "-o" if label in ADAPTIVE or label in FIXED else "--s"
-            axis.loglog([seconds for _, seconds in points], [error for error, _ in points], style, label=label, ms=4)
+            axis.loglog(
+                *zip(*[(seconds, error) for error, seconds in points], strict=True), style, color=colors[label], ms=4
+            )
         axis.set(title=f"{name}, {size} vertices", xlabel="seconds", ylabel="relative error")
         axis.grid(alpha=0.3)
-    axes[0, -1].legend(fontsize=8)
+    for axis in axes.flat[len(found) :]:
+        axis.axis("off")
+    for label in labels:
+        style = "-o" if label in ADAPTIVE or label in FIXED else "--s"
+        axes.flat[-1].plot([], [], style, color=colors[label], label=label, ms=4)
+    axes.flat[-1].legend(loc="center", fontsize=10, frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 

@@ -137,6 +137,7 @@ def test_principal_curvatures_of_a_cylinder():
     assert (bend.principal[:, 0] >= bend.principal[:, 1]).all()
 
 
+@pytest.mark.slow
 def test_curvature_is_differentiable_in_the_vertices_also_where_it_is_the_same_in_all_directions():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
 

@@ -8,7 +8,6 @@ import pytest
 
 import ltljax as ltl
 from ltljax.run import count_maxima
-from ltljax.solve.evolve import default_solver
 
 # Of real meshes, which have a few.
 pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
@@ -38,9 +37,9 @@ def test_a_source_may_depend_on_time_and_place(sphere):
 
 
 @pytest.mark.parametrize("evaluations_at_most", [2000])
-def test_rkc2_is_second_order_in_time_where_explicit_steps_would_be_unstable(sphere, evaluations_at_most):
+def test_the_default_is_second_order_in_time_where_explicit_steps_would_be_unstable(sphere, evaluations_at_most):
     equation = ltl.Diffusion()
-    solver = default_solver(sphere)
+    solver = ltl.RKL2()
     u0 = sphere.vertices.prod(axis=1) + sphere.vertices[:, 0]
     rate = np.array(ltl.laplacian_matrix(sphere).todense())
     values, vectors = np.linalg.eig(rate)

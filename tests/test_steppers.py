@@ -59,7 +59,7 @@ def test_fixed_steps_have_the_order_of_the_method(sphere, decay, name):
     assert errors[-1] < 0.1**order
 
 
-@pytest.mark.parametrize("name", ["TRBDF2", "SBDF2", "KenCarp3", "RKL2"])
+@pytest.mark.parametrize("name", ["TRBDF2", "SBDF2", pytest.param("KenCarp3", marks=pytest.mark.slow), "RKL2"])
 def test_the_order_holds_with_a_source_in_time_and_a_reaction(sphere, name):
     solver, order, counts = SOLVERS[name]
     x = sphere.vertices
@@ -280,3 +280,14 @@ def test_newton_solves_a_stiff_reaction(sphere, name):
     u0 = 1 + 0.5 * sphere.vertices[:, :1]
     end = ltl.solve(relax, sphere, u0, 1.0, solver=SOLVERS[name][0]).us[-1]
     np.testing.assert_allclose(end, 1, atol=1e-3)
+
+
+def test_long_stiff_runs_take_implicit_steps_by_themselves(sphere):
+    def chosen(diffusivity, **how):
+        return ltl.solve(ltl.Diffusion(diffusivity), sphere, sphere.vertices[:, 0], 1.0, **how).stats["solver"]
+
+    assert chosen(1.0).startswith("RKL2: explicit")
+    assert chosen(1e4).startswith("TRBDF2: implicit")
+    assert chosen(1e4, solver=ltl.RKL2()).startswith("RKL2: chosen by the caller")
+    traced = jax.jit(lambda d: ltl.solve(ltl.Diffusion(d), sphere, sphere.vertices[:, 0], 1.0, max_steps=10))
+    assert traced(1e4).method.startswith("RKL2")

@@ -51,6 +51,7 @@ def test_the_memory_of_the_ring_table_follows_the_sum_of_valences(valence):
     assert ltl.Surface.from_mesh(mesh, ltl.Paper()).topology.ring.num_slots <= 1.5 * mesh.faces.size
 
 
+@pytest.mark.slow
 def test_operators_are_right_on_long_rows():
     mesh = poles(60)
     u = mesh.vertices.prod(axis=1) + mesh.vertices[:, 2] ** 2

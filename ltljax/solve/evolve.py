@@ -21,7 +21,7 @@ from ..operators import growth_rate, spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
 from . import checks
-from .implicit import SBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
+from .implicit import SBDF2, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
 from .stabilised import RKL2
@@ -30,6 +30,9 @@ from .stabilised import RKL2
 _OVERFLOW = 1e6
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
+
+# Runs this many times as long as the fastest decay are quicker with implicit steps: see benchmarks/time_to_accuracy.md.
+_STIFF = 1e5
 
 # Intervals of a run that is kept on disk.
 _INTERVALS = 20
@@ -149,9 +152,10 @@ def solve(
     """The solution of an evolution equation at given times.
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
-    species, which does not depend on the size of the mesh. The default solver is `RKL2` for ``Monotone`` surfaces,
-    whose diffusion has eigenvalues near the negative real axis and a cheap bound of them, and `diffrax.Tsit5` for
-    ``Paper`` ones, of which neither is true. ``solution.stats`` says which it was and why.
+    species, which does not depend on the size of the mesh. The default solver is `RKL2`, whose cost grows with the
+    square root of the stiffness; for runs that are 1e5 times as long as the fastest decay `TRBDF2`, where the extra
+    `amg` is at hand and the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
+    eigenvalues are off the real axis, `diffrax.Tsit5`. ``solution.stats`` says which it was and why.
 
     Solvers: any explicit one of diffrax; `RKL2` (second order) and `RKL1` (first, with the maximum principle),
     explicit and stabilised; `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`, `5`, implicit;
@@ -213,13 +217,17 @@ def solve(
     checks.finite(equation, u0)
     if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
         _warn_of_growth(surface)
-    method = default_solver(surface) if solver is None else without_matrices(solver)
-    why = _reason(surface) if solver is None else "chosen by the caller"
+    # As arrays, so that other tolerances need no compiling.
+    relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
+    if solver is None:
+        method, why = _choice(equation, surface, u0, t0, t1)
+    else:
+        method, why = without_matrices(solver), "chosen by the caller"
     if isinstance(method, SBDF2) and dt is None:
         raise ValueError("SBDF2 takes fixed steps: give their length as dt, or use diffrax.KenCarp3().")
     if isinstance(method, ImplicitRungeKutta | SBDF2):
         inverse = hierarchy(equation, surface, u0, t0) if preconditioner is None else preconditioner
-        method = dataclasses.replace(method, preconditioning=Preconditioning(inverse, rtol, atol))
+        method = dataclasses.replace(method, preconditioning=Preconditioning(inverse, relative, absolute))
         why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
         checks.step(equation, surface, u0, t0, dt, method)
@@ -231,8 +239,8 @@ def solve(
         # Time in the state's own float type: diffrax multiplies the two.
         begin, end = jnp.asarray(begin, surface.dtype), jnp.asarray(end, surface.dtype)
         return _solve(
-            equation, surface, u, begin, end, times, method, adjoint, _meter(progress), rtol, atol, grid, max_steps,
-            stop_when, dense, name,
+            equation, surface, u, begin, end, times, method, adjoint, _meter(progress), relative, absolute, grid,
+            max_steps, stop_when, dense, name,
         )  # fmt: skip
 
     if checkpoint_dir is None:
@@ -255,15 +263,26 @@ def solve(
     return solution
 
 
-def default_solver(surface: Surface) -> diffrax.AbstractSolver:
-    """The solver `solve` takes by itself."""
-    return diffrax.Tsit5() if isinstance(surface.scheme, Paper) else RKL2()
+@eqx.filter_jit
+def _bound(equation: Equation, t: Array, surface: Surface, u: Array) -> Array:
+    return equation.spectral_bound(t, surface, u)
 
 
-def _reason(surface: Surface) -> str:
+def _choice(
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike
+) -> tuple[diffrax.AbstractSolver, str]:
+    """The solver that is taken where the caller names none, and why."""
     if isinstance(surface.scheme, Paper):
-        return "the published operator has eigenvalues off the real axis and no cheap bound of them"
-    return "explicit, with as many stages as the stiffness asks for"
+        return diffrax.Tsit5(), "the published operator has eigenvalues off the real axis and no cheap bound of them"
+    explicit = "explicit, with as many stages as the stiffness asks for"
+    bound = _bound(equation, jnp.asarray(t0, surface.dtype), surface, u0)
+    if any(isinstance(value, Tracer) for value in (bound, t0, t1)) or surface.is_traced or not is_available():
+        return RKL2(), explicit
+    span = float(bound) * (float(t1) - float(t0))  # type: ignore
+    diffuses = bool(jnp.any(equation.diffusivities(u0) > 0))
+    if span < _STIFF or not diffuses:
+        return RKL2(), explicit
+    return TRBDF2(), f"implicit, as the run is {span:.1e} times as long as the fastest decay"
 
 
 def hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) -> Multigrid | None:
