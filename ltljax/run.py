@@ -218,7 +218,7 @@ def count_maxima(mesh: Mesh, values: np.ndarray) -> int:
 
 
 def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress) -> list[str]:
-    from .output import colors, files, pictures, viewer
+    from .output import colors, files, pictures, texture, viewer
 
     # What was computed in an order that keeps neighbours together is written in that of the source.
     order = example.mesh.source_order
@@ -246,6 +246,13 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     if not pictures.can_draw():
         print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
         return written
+    if example.mesh.uv is not None:
+        folder = out / "textured"
+        folder.mkdir(exist_ok=True)
+        baked = texture.bake(example.mesh.uv, faces, fields[-1][shown])
+        image = colors.vertex_colors(baked.ravel(), limits, colormap)[:, :3].reshape(*baked.shape, 3)
+        texture.write_textured_obj(folder / f"{name}.obj", vertices, faces, example.mesh.uv, image)
+        written.append(f"textured/{name}.obj")
     picture = pictures.Picture(vertices, faces, shown, limits, colormap)
     captions = [f"{name}   t = {t:.3g}" for t in times]
     images = [picture.draw(state[shown], text) for state, text in zip(fields, captions, strict=True)]

@@ -35,6 +35,7 @@ class Checked:
         faces: (F, 3) int32.
         original_index: (V,) for each vertex, the first vertex handed in that it came from.
         welded_index: (V_original,) for each vertex handed in, the vertex it became, or -1.
+        original_corner: (F, 3) for each corner of a face, 3 f + j of corner j of the face f handed in.
         faces_in_file: number of faces handed in.
         welded_vertices: vertices merged into another.
         reoriented_faces: faces turned over.
@@ -45,6 +46,7 @@ class Checked:
     faces: np.ndarray
     original_index: np.ndarray
     welded_index: np.ndarray
+    original_corner: np.ndarray
     faces_in_file: int
     welded_vertices: int
     reoriented_faces: int
@@ -91,6 +93,7 @@ def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
         faces=new_index[work.faces].astype(np.int32),
         original_index=work.origin[used],
         welded_index=welded_index,
+        original_corner=work.corners,
         faces_in_file=len(faces),
         welded_vertices=int(np.sum((representative >= 0) & (representative != np.arange(len(representative))))),
         reoriented_faces=reoriented,
@@ -132,6 +135,7 @@ class _Workpiece:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, repair: bool):
         self.vertices = vertices
         self.faces = faces
+        self.corners = np.arange(faces.size).reshape(-1, 3)
         self.repair = repair
         self.repairs: list[str] = []
         self.origin = np.arange(len(vertices))
@@ -143,7 +147,7 @@ class _Workpiece:
             return
         if not self.repair:
             raise MeshError(message(int(np.flatnonzero(is_bad)[0])))
-        self.faces = self.faces[~is_bad]
+        self.faces, self.corners = self.faces[~is_bad], self.corners[~is_bad]
         self.repairs.append(f"dropped {count} {'face' if count == 1 else 'faces'} {what}")
         if not len(self.faces):
             raise MeshError(f"Repair left no faces: {'; '.join(self.repairs)}. The source holds no usable surface.")
@@ -339,5 +343,7 @@ class _Workpiece:
     def orient(self) -> int:
         """Turns faces over until all agree with their neighbours and closed components face out; returns how many."""
         is_turned = turned_faces(self.vertices, self.faces)
-        self.faces = np.where(is_turned[:, None], self.faces[:, [0, 2, 1]], self.faces)
+        self.faces, self.corners = (
+            np.where(is_turned[:, None], rows[:, [0, 2, 1]], rows) for rows in (self.faces, self.corners)
+        )
         return int(is_turned.sum())

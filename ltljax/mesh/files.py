@@ -36,7 +36,7 @@ def load_mesh(path: str | PathLike[str], *, repair: bool = False, weld: bool = T
     path = Path(path)
     try:
         polygons = _read(path)
-        return Mesh(polygons.vertices, polygons.faces, repair=repair, weld=weld)
+        return Mesh(polygons.vertices, polygons.faces, repair=repair, weld=weld, uv=polygons.uv)
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error.__cause__
 

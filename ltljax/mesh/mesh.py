@@ -29,6 +29,7 @@ class Mesh:
         original_index: (V,) int64, for each vertex the (first) vertex it came from in the file or array handed in.
         welded_index: (V_original,) int64, for each vertex handed in the one it became, or -1 if it was dropped.
         normals: (V, 3) float64, exact unit outward normals where the shape is known by formula, else None.
+        uv: (F, 3, 2) float64, places in an image of the corners of every face, where the file has them, else None.
         source_order: (V,) int32, the vertices in the order they were handed in: ``data[mesh.source_order]`` undoes
             `reordered`; without it 0, 1, 2, ...
     """
@@ -38,11 +39,19 @@ class Mesh:
     original_index: np.ndarray
     welded_index: np.ndarray
     normals: np.ndarray | None
+    uv: np.ndarray | None
     source_order: np.ndarray
     _checked: Checked
 
     def __init__(
-        self, vertices: Any, faces: Any, *, repair: bool = False, weld: bool = False, normals: Any | None = None
+        self,
+        vertices: Any,
+        faces: Any,
+        *,
+        repair: bool = False,
+        weld: bool = False,
+        normals: Any | None = None,
+        uv: Any | None = None,
     ):
         """Checks the arrays.
 
@@ -54,6 +63,7 @@ class Mesh:
                 report lists each action.
             weld: merge vertices at exactly the same position.
             normals: (V, 3) exact unit outward normals, if the surface is known by formula.
+            uv: (F, 3, 2) places in an image of the corners of every face, v upwards.
 
         Raises:
             MeshError: if the arrays are not a surface; the message names the first offending index.
@@ -70,9 +80,17 @@ class Mesh:
             if is_bad.any():
                 first = int(checked.original_index[np.flatnonzero(is_bad)[0]])
                 raise MeshError(f"Normals must have length 1, but the one at vertex {first} has not. Normalise them.")
-        self._fill(checked, unit_normals, np.arange(len(checked.vertices), dtype=np.int32))
+        places = None
+        if uv is not None:
+            places = np.asarray(uv, dtype=np.float64)
+            if places.shape != (checked.faces_in_file, 3, 2):
+                raise MeshError(f"Expected uv of shape {(checked.faces_in_file, 3, 2)}, found {places.shape}.")
+            places = places.reshape(-1, 2)[checked.original_corner]
+        self._fill(checked, unit_normals, places, np.arange(len(checked.vertices), dtype=np.int32))
 
-    def _fill(self, checked: Checked, normals: np.ndarray | None, source_order: np.ndarray) -> None:
+    def _fill(
+        self, checked: Checked, normals: np.ndarray | None, uv: np.ndarray | None, source_order: np.ndarray
+    ) -> None:
         """Sets the fields, once, and makes their arrays read-only."""
         fields = {
             "vertices": checked.vertices,
@@ -80,6 +98,7 @@ class Mesh:
             "original_index": checked.original_index,
             "welded_index": checked.welded_index,
             "normals": normals,
+            "uv": uv,
             "source_order": source_order,
             "_checked": checked,
         }
@@ -227,7 +246,7 @@ class Mesh:
                 f"weights need {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}. Use a factor closer to 1."
             )
         mesh = object.__new__(Mesh)
-        mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals, self.source_order)
+        mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals, self.uv, self.source_order)
         return mesh
 
     def reordered(self) -> "Mesh":
@@ -248,7 +267,8 @@ class Mesh:
             welded_index=np.where(self.welded_index < 0, -1, place[self.welded_index]).astype(np.int64),
         )
         mesh = object.__new__(Mesh)
-        mesh._fill(checked, None if self.normals is None else self.normals[order], place[self.source_order])
+        normals = None if self.normals is None else self.normals[order]
+        mesh._fill(checked, normals, self.uv, place[self.source_order])
         return mesh
 
     def __repr__(self) -> str:

@@ -16,10 +16,11 @@ from .errors import MeshError
 
 
 class Polygons(NamedTuple):
-    """Vertices (V, 3) in the order of the file, and triangles (F, 3)."""
+    """Vertices (V, 3) in the order of the file, triangles (F, 3), and places of their corners in an image (F, 3, 2)."""
 
     vertices: np.ndarray
     faces: np.ndarray
+    uv: np.ndarray | None = None
 
 
 def fan(corners: Sequence[int] | np.ndarray, sizes: Sequence[int] | np.ndarray) -> np.ndarray:
@@ -39,11 +40,14 @@ def fan(corners: Sequence[int] | np.ndarray, sizes: Sequence[int] | np.ndarray) 
 
 
 def parse_obj(data: bytes) -> Polygons:
-    """Wavefront OBJ: the ``v`` and ``f`` lines."""
+    """Wavefront OBJ: the ``v``, ``vt`` and ``f`` lines."""
     text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     # Flat lists: a million small ones would keep the garbage collector busy for longer than the reading takes.
     coordinates: list[float] = []
+    places: list[float] = []
     corners: list[int] = []
+    # The entry of `places` for each corner, or -1 where there is none.
+    placed: list[int] = []
     sizes: list[int] = []
     for number, line in enumerate(text.split("\n"), start=1):
         words = line.partition("#")[0].split()
@@ -53,15 +57,24 @@ def parse_obj(data: bytes) -> Polygons:
             if words[0] == "v":
                 x, y, z = words[1:4]
                 coordinates += (float(x), float(y), float(z))
+            elif words[0] == "vt":
+                places += (float(words[1]), float(words[2]) if len(words) > 2 else 0.0)
             elif words[0] == "f":
                 # 7/1/3 is vertex 7 with a texture and a normal. Negative numbers count back from the latest vertex.
                 indices = [int(word.partition("/")[0]) for word in words[1:]]
                 latest = len(coordinates) // 3
                 corners += [index - 1 if index >= 0 else latest + index for index in indices]
                 sizes.append(len(indices))
+                for word in words[1:]:
+                    second = word.split("/")[1] if "/" in word else ""
+                    index = int(second) if second else 0
+                    placed.append(index - 1 if index >= 0 else len(places) // 2 + index)
         except ValueError:
             raise MeshError(f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it.") from None
-    return Polygons(np.array(coordinates, dtype=np.float64).reshape(-1, 3), fan(corners, sizes))
+    vertices, uv = np.array(coordinates, dtype=np.float64).reshape(-1, 3), None
+    if placed and min(placed) >= 0 and max(placed) < len(places) // 2:
+        uv = np.array(places, dtype=np.float64).reshape(-1, 2)[fan(placed, sizes)]
+    return Polygons(vertices, fan(corners, sizes), uv)
 
 
 def parse_off(data: bytes) -> Polygons:
