@@ -40,7 +40,7 @@ def test_a_run_writes_picture_animation_series_surface_and_summary(tmp_path, mes
     mesh = ltl.shapes.icosphere(3)
     assert main(["run", "turing", "--mesh", mesh_file(mesh), "--out", str(out), "--frames", "4"]) == 0
     assert {p.name for p in out.iterdir()} == {
-        "turing.png", "turing.mp4", "turing.pvd", "turing.ply", "series", "summary.json",
+        "turing.png", "turing.mp4", "turing.glb", "turing.html", "turing.pvd", "turing.ply", "series", "summary.json",
     }  # fmt: skip
     summary = json.loads((out / "summary.json").read_text())
     assert summary["mesh"]["vertices"] == 642

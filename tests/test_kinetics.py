@@ -162,7 +162,7 @@ def pattern(level, diffusivity, kinetics, t1, amplitude=0.1, seed=0):
     start = np.sin(mesh.vertices @ waves.T + phases).sum(axis=1) / np.sqrt(20)
     u0 = np.asarray(kinetics.steady_state()) + amplitude * start[:, None] * np.array([1.0, -1.0])
     equation = ltl.ReactionDiffusion(diffusivity, kinetics)
-    return ltl.solve(equation, surface, u0, t1, rtol=1e-3, atol=1e-4).u_end, surface, mesh
+    return ltl.solve(equation, surface, u0, t1, solver=ltl.RKL2(), rtol=1e-3, atol=1e-4).u_end, surface, mesh
 
 
 def test_barrios_model_makes_spots_or_stripes():
@@ -178,3 +178,12 @@ def test_barrios_model_makes_spots_or_stripes():
 def test_turks_model_makes_about_forty_spots():
     u, _, mesh = pattern(4, (0.8, 0.1), ltl.kinetics.turk(), 40.0)
     assert 30 <= count_maxima(mesh, -np.asarray(u[:, 1])) + count_maxima(mesh, np.asarray(u[:, 1])) <= 120
+
+
+@pytest.mark.parametrize("finest", [5, pytest.param(6, marks=pytest.mark.slow)])
+def test_the_wavelength_of_a_pattern_does_not_change_with_the_mesh(finest):
+    lengths = []
+    for level in range(4, finest + 1):
+        u, surface, _ = pattern(level, (1.0, 10.0), ltl.kinetics.schnakenberg(rate=150.0), 1.5)
+        lengths.append(wavelength(surface, u[:, 0]))
+    assert np.ptp(lengths) < 0.05 * lengths[-1]
