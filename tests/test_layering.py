@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "formulas": set(),
     "equations": {"elliptic", "operators", "surface", "tables"},
     "solve": {"equations", "operators", "surface", "tables", "lifting", "mesh"},
+    "fit": {"equations", "operators", "surface", "tables", "solve", "progress", "output"},
     "output": set(),
     "show": {"surface", "solve", "tables", "output"},
     "scenario": {"formulas", "mesh", "lifting", "elliptic", "equations", "operators", "surface", "solve", "output"},

@@ -24,7 +24,7 @@ from . import checks
 from .implicit import SBDF2, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
-from .stabilised import RKL2
+from .stabilised import RKL2, differentiable
 
 # A state that grows this much over its start (or over one) is on its way to overflow.
 _OVERFLOW = 1e6
@@ -233,6 +233,7 @@ def solve(
         checks.step(equation, surface, u0, t0, dt, method)
     name = f"{type(method if solver is None else solver).__name__}: {why}"
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    method = differentiable(method, adjoint)
     grid = _grid(t0, t1, times, dt)
 
     def advance(u, begin, end, times, grid):

@@ -1,6 +1,7 @@
 """Stabilised explicit steppers for diffusion: many cheap stages, and a step that grows with their square."""
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -27,6 +28,7 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
     """What the steppers share: a recurrence over as many stages as the length of a step needs."""
 
     spectral_bound: eqx.AbstractVar[Callable[..., Float[Array, ""]]]
+    loop_kind: eqx.AbstractVar[str]
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation
@@ -68,7 +70,7 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         first = mu_rate[1] * dt * rate0
         start = (jnp.full((), 2, stages.dtype), jnp.zeros_like(y0), first)
         _, _, increment = eqxi.while_loop(
-            lambda carry: carry[0] <= stages, stage, start, max_steps=int(counts[-1]), kind="checkpointed"
+            lambda carry: carry[0] <= stages, stage, start, max_steps=int(counts[-1]), kind=self.loop_kind
         )
         y1 = y0 + increment
         rate1 = terms.vf(t1, y1, args)
@@ -86,6 +88,15 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
 
+def differentiable(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
+    """The solver with a loop over stages that has the derivatives of the adjoint's loop over steps."""
+    if isinstance(solver, _Stabilised) and isinstance(adjoint, diffrax.ForwardMode):
+        return dataclasses.replace(solver, loop_kind="lax")
+    if isinstance(solver, _Stabilised) and isinstance(adjoint, diffrax.DirectAdjoint):
+        return dataclasses.replace(solver, loop_kind="bounded")
+    return solver
+
+
 class RKL2(_Stabilised):
     """Runge-Kutta-Legendre of second order, explicit, adaptive, for ``u_t = f(t, u)`` with a stiff diffusion part.
 
@@ -97,12 +108,15 @@ class RKL2(_Stabilised):
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
+        loop_kind: of the loop over stages, as equinox names them: ``"checkpointed"`` for derivatives in reverse mode,
+            ``"lax"`` for forward mode; `solve` chooses it by its adjoint.
 
     Source: Meyer, Balsara and Aslam (2014), A stabilized Runge-Kutta-Legendre method for explicit super-time-stepping
     of parabolic and mixed equations, doi:10.1016/j.jcp.2013.08.021, equations 14 to 18.
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
+    loop_kind: str = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
         """Two."""
@@ -129,11 +143,14 @@ class RKL1(_Stabilised):
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
+        loop_kind: of the loop over stages, as equinox names them: ``"checkpointed"`` for derivatives in reverse mode,
+            ``"lax"`` for forward mode; `solve` chooses it by its adjoint.
 
     Source: as of `RKL2`, equations 8 to 11 (the formula), section 4 (the maximum principle).
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
+    loop_kind: str = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
         """One."""

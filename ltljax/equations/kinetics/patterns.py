@@ -196,7 +196,7 @@ def _gierer_meinhardt_at_rest(p):
 
 def meinhardt(
     production: Number = 0.04, decay: Number = 0.06, inhibitor_decay: Number = 0.06, relay: Number = 0.04,
-    source: Number = 0.0, floor: Number = 1e-3,
+    source: Number = 0.01, floor: Number = 1e-3,
 ) -> Kinetics:  # fmt: skip
     """Five species that make stripes: two activators that exclude one another where they are, and help nearby.
 
@@ -216,7 +216,8 @@ def meinhardt(
         decay: a, of the activators; random variation over the vertices seeds the pattern.
         inhibitor_decay: b, of the repressor.
         relay: k, the rate at which p and q follow g and h.
-        source: s, a basic production of the activators.
+        source: s, a basic production of the activators; without one a species that is driven out does not come back,
+            and both may die out.
         floor: the least r in the quotients.
 
     Source: Meinhardt (1982), Models of Biological Pattern Formation, section 12; Turk (1991),

@@ -1,0 +1,168 @@
+"""Many fits at once, from many starts or to many data sets; and where to start when a loss has many valleys."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from .observations import Observations
+from .problem import FitResiduals, Model, Residuals, forward_adjoint, prepare
+from .unknowns import unknowns
+
+
+class ManyFits(eqx.Module):
+    """Fits that ran at once.
+
+    Attributes:
+        params: the parameters, with the fits along a new first axis.
+        losses: (N,) of each.
+        num_steps: (N,).
+        converged: (N,).
+    """
+
+    params: Any
+    losses: Float[Array, " N"]
+    num_steps: Array
+    converged: Bool[Array, " N"]
+
+    @property
+    def best(self) -> Any:
+        """The parameters of the least loss."""
+        return jax.tree.map(lambda leaf: leaf[jnp.nanargmin(self.losses)], self.params)
+
+
+def fit_many(
+    model: Model,
+    starts: Any,
+    data: Observations,
+    *,
+    values: Any = None,
+    transforms: Any = None,
+    penalty: Residuals | None = None,
+    method: Any = None,
+    rtol: float = 1e-5,
+    atol: float = 1e-7,
+    max_steps: int = 60,
+) -> ManyFits:
+    """Many fits at once, from many starts or to many data sets, by `jax.vmap` over the whole of `fit`'s iteration.
+
+    Args:
+        model: as of `fit`.
+        starts: the first guesses, along a first axis (N, ...) of every leaf; with ``values`` one for all.
+        data: the `Observations`; with ``values`` their shape, noise, times and vertices.
+        values: (N, ...) the values of many data sets, in place of those of ``data``.
+        transforms: as of `fit`.
+        penalty: as of `fit`.
+        method: as of `fit`, of optimistix.
+        rtol: as of `fit`.
+        atol: as of `fit`.
+        max_steps: as of `fit`.
+
+    Raises:
+        ValueError: as of `fit`, or the first axes do not fit.
+    """
+    many = None if values is None else jnp.asarray(values, data.values.dtype)
+    if many is not None and many.shape[1:] != data.values.shape:
+        raise ValueError(f"Expected values of shape (N, {data.values.shape}), found {many.shape}.")
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(starts)]
+    shapes = {leaf.shape[:1] for leaf in leaves}
+    if values is None and (len(shapes) != 1 or shapes == {()}):
+        raise ValueError(f"Expected starts with one first axis of equal length in every leaf, found {sorted(shapes)}.")
+    rows = len(leaves[0]) if many is None else None
+    # The ranges are asked of every start, the scales are those of the first.
+    each = (
+        [starts] if rows is None else [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], starts) for k in range(rows)]
+    )
+    space, *_ = [unknowns(start, transforms) for start in each]
+    z = jnp.stack([space.free(start) for start in each])
+    problem = prepare(model, space, data, penalty, method, z[0], rtol, atol)
+
+    def one(z, values):
+        residuals = problem.residuals
+        if values is not None:
+            residuals = eqx.tree_at(lambda r: r.data.values, residuals, values)
+        converted = dataclasses.replace(problem, residuals=residuals).converted(z)
+        function = problem.function(converted, z)
+        call = optx.least_squares if problem.is_least_squares else optx.minimise
+        out = call(function, problem.solver, z, has_aux=True, throw=False, max_steps=max_steps)
+        loss = 0.5 * jnp.sum(converted(out.value) ** 2)
+        return space.params(out.value), loss, out.stats["num_steps"], out.result == optx.RESULTS.successful
+
+    if many is None:
+        whole, along = lambda z: one(z, None), z
+    else:
+        whole, along = lambda values: one(z[0], values), many
+    # With the arrays it reads as leaves: as constants of the program they would be folded, slowly.
+    converted = eqx.filter_closure_convert(whole, along[0])
+    mapped = eqx.filter_jit(eqx.filter_vmap(lambda converted, one: converted(one), in_axes=(None, 0)))
+    return ManyFits(*mapped(converted, along))
+
+
+def explore(
+    model: Model,
+    low: Any,
+    high: Any,
+    data: Observations,
+    *,
+    count: int = 64,
+    keep: int = 8,
+    batch: int = 16,
+    seed: int = 0,
+    logarithmic: bool = True,
+) -> tuple[Any, np.ndarray]:
+    """First guesses by a global search: the model at points that fill a box evenly, the best kept (host).
+
+    For losses with many valleys, such as statistics of patterns; the guesses are starts of `fit_many`. The points are
+    Sobol's sequence, scrambled.
+
+    Args:
+        model: as of `fit`.
+        low: the least values: a pytree of floats.
+        high: the largest ones.
+        data: the `Observations`.
+        count: of points; a power of two fills best.
+        keep: how many to return.
+        batch: how many to run at once.
+        seed: of the scrambling.
+        logarithmic: whether positive ranges are filled evenly in the logarithm.
+
+    Returns:
+        The guesses, along a first axis of every leaf, the best first; and their losses.
+
+    Raises:
+        ValueError: a range is empty, or data and model do not go together.
+    """
+    from scipy.stats import qmc
+
+    (least, rebuild), (most, _) = (
+        ravel_pytree(jax.tree.map(np.float64, low)),
+        ravel_pytree(jax.tree.map(np.float64, high)),
+    )
+    least, most = np.asarray(least), np.asarray(most)
+    if least.shape != most.shape or not (least < most).all():
+        raise ValueError(f"Expected low < high for every parameter, found {low} and {high}.")
+    share = qmc.Sobol(len(least), seed=seed).random(count)
+    in_log = (least > 0) & logarithmic
+    safe = np.where(in_log, least, 1.0), np.where(in_log, most, 1.0)
+    points = np.where(in_log, safe[0] * (safe[1] / safe[0]) ** share, least + (most - least) * share)
+    space = unknowns(rebuild(jnp.asarray(points[0])))
+    residuals = FitResiduals(model, data, space, None, forward_adjoint(model))
+    free = jax.vmap(lambda point: space.free(rebuild(point)))
+    z = np.asarray(free(jnp.asarray(points, jnp.result_type(float))))
+    data.check(eqx.filter_eval_shape(lambda z: residuals.predicted(z), z[0]))
+    converted = eqx.filter_closure_convert(lambda z: residuals(z), jnp.asarray(z[0]))
+    several = eqx.filter_jit(lambda c, z: jax.vmap(lambda z: 0.5 * jnp.sum(c(z) ** 2))(z))
+    batch = min(batch, count)
+    losses = np.empty(count)
+    for begin in range(0, count, batch):
+        # The last batch reaches back, so that all have one shape.
+        begin = min(begin, count - batch)
+        losses[begin : begin + batch] = np.asarray(several(converted, jnp.asarray(z[begin : begin + batch])))
+    best = np.argsort(losses)[:keep]
+    return jax.vmap(rebuild)(jnp.asarray(points[best])), losses[best]
