@@ -289,5 +289,9 @@ def test_long_stiff_runs_take_implicit_steps_by_themselves(sphere):
     assert chosen(1.0).startswith("RKL2: explicit")
     assert chosen(1e4).startswith("TRBDF2: implicit")
     assert chosen(1e4, solver=ltl.RKL2()).startswith("RKL2: chosen by the caller")
+    # A reaction may be stiff itself, which implicit steps are bad at.
+    reacting = ltl.ReactionDiffusion((1e4,), lambda species, _: (-species[0],))
+    found = ltl.solve(reacting, sphere, sphere.vertices[:, :1], 1.0, max_steps=10, throw=False)
+    assert found.method.startswith("RKL2: explicit")
     traced = jax.jit(lambda d: ltl.solve(ltl.Diffusion(d), sphere, sphere.vertices[:, 0], 1.0, max_steps=10))
     assert traced(1e4).method.startswith("RKL2")

@@ -31,7 +31,8 @@ _OVERFLOW = 1e6
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
 
-# Runs this many times as long as the fastest decay are quicker with implicit steps: see benchmarks/time_to_accuracy.md.
+# Linear runs this many times as long as the fastest decay are quicker with implicit steps, see
+# benchmarks/time_to_accuracy.md. With a reaction they can be slower by a hundred times, where it is stiff itself.
 _STIFF = 1e5
 
 # Intervals of a run that is kept on disk.
@@ -153,8 +154,8 @@ def solve(
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
     species, which does not depend on the size of the mesh. The default solver is `RKL2`, whose cost grows with the
-    square root of the stiffness; for runs that are 1e5 times as long as the fastest decay `TRBDF2`, where the extra
-    `amg` is at hand and the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
+    square root of the stiffness; for linear equations and runs 1e5 times as long as the fastest decay `TRBDF2`, where
+    the extra `amg` is at hand and the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
     eigenvalues are off the real axis, `diffrax.Tsit5`. ``solution.stats`` says which it was and why.
 
     Solvers: any explicit one of diffrax; `RKL2` (second order) and `RKL1` (first, with the maximum principle),
@@ -281,7 +282,7 @@ def _choice(
         return RKL2(), explicit
     span = float(bound) * (float(t1) - float(t0))  # type: ignore
     diffuses = bool(jnp.any(equation.diffusivities(u0) > 0))
-    if span < _STIFF or not diffuses:
+    if span < _STIFF or not diffuses or not equation.is_affine:
         return RKL2(), explicit
     return TRBDF2(), f"implicit, as the run is {span:.1e} times as long as the fastest decay"
 
