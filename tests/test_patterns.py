@@ -175,11 +175,13 @@ def test_lotka_and_volterras_populations_cycle_and_stay_positive():
     assert np.ptp(prey) < 1
 
 
-def test_stripes_keep_to_the_circles_of_latitude():
-    us, surface, _, _ = ran("zebra")
+@pytest.mark.parametrize("name", ["zebra", "rings"])
+def test_stripes_keep_to_circles_of_latitude_or_go_around_the_tube(name):
+    us, surface, _, _ = ran(name)
     x = np.asarray(surface.vertices)
     slope = np.asarray(ltl.gradient(surface, jnp.asarray(us[-1][:, 0])))
-    along = np.stack([-x[:, 1], x[:, 0], 0 * x[:, 0]], axis=1)
+    round_the_axis = np.stack([-x[:, 1], x[:, 0], 0 * x[:, 0]], axis=1)
+    along = round_the_axis if name == "zebra" else np.cross(round_the_axis, np.asarray(surface.normals))
     where = np.hypot(x[:, 0], x[:, 1]) > 0.5
     steep = np.linalg.norm(slope, axis=1)
     cosine = np.abs((slope * along).sum(axis=1)) / (steep * np.linalg.norm(along, axis=1) + 1e-30)

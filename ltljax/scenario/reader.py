@@ -106,6 +106,10 @@ class Table:
             raise self.error(key, "a text")
         return self._take(key, value)
 
+    def peek(self, key: str) -> Any:
+        """What a key holds, unchecked and not counted as used; None where there is none."""
+        return self._values.get(key)
+
     def choice(self, key: str, allowed: Collection[str], default: str | None = None) -> str:
         """One of several words."""
         value = self._values.get(key, default)

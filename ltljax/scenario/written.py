@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..elliptic import direction_tensor, elliptic_stencil
-from ..equations import CahnHilliard, Equation, ReactionDiffusion, kinetics
+from ..equations import CahnHilliard, Diffusion, Equation, ReactionDiffusion, kinetics
 from ..formulas import Formula
 from ..mesh import Mesh, load_mesh, shapes
+from ..operators import curvature
 from ..output.colors import COLORMAPS
-from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson
+from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface
 from .paper import parse_condition
 from .reader import ScenarioError, Table, load
@@ -49,6 +50,8 @@ _SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
     "square": (shapes.square, {"n": (100, 1500)}),
     "cylinder": (shapes.cylinder, {"n_around": (120, 2000), "n_along": (80, 2000)}),
 }
+# Direction fields by name: that in which the surface bends most, around limbs, and least, along them.
+_CURVED = {"greatest-curvature": True, "least-curvature": False}
 # States of more bytes than this are not kept without being asked twice.
 _MOST_BYTES = 8e9
 
@@ -304,11 +307,19 @@ def _field(table: Table, key: str, place, default: Any = None) -> np.ndarray | f
     return _finite(place(formula, key), table, key)
 
 
-def _direction(table: Table, place, species: tuple[str, ...]) -> tuple[np.ndarray, float, tuple[str, ...]] | None:
+def _direction(
+    table: Table, place, species: tuple[str, ...]
+) -> tuple[Callable[[Surface], np.ndarray], float, tuple[str, ...]] | None:
     """The field along which species diffuse faster, how much, and which do."""
     if not table.names():
         return None
-    field = _vectors(table, "field", place)
+    if isinstance(table.peek("field"), str):
+        which = table.choice("field", tuple(_CURVED))
+        smoothing = table.number("smoothing", 0.1, 0.0, 1e3)
+        field = functools.partial(_principal, largest=_CURVED[which], smoothing=smoothing)
+    else:
+        vectors = _vectors(table, "field", place)
+        field = lambda surface: vectors  # noqa: E731
     ratio = table.number("ratio", 4.0, 1e-3, 1e3)
     # With all species alike a pattern would be stretched, and keep no direction.
     which = tuple(table.texts("species")) or species[:1]
@@ -316,6 +327,20 @@ def _direction(table: Table, place, species: tuple[str, ...]) -> tuple[np.ndarra
         raise table.error("species", f"some of {', '.join(species)} without {unknown[0]!r}")
     table.finish()
     return field, ratio, which
+
+
+def _principal(surface: Surface, largest: bool, smoothing: float) -> np.ndarray:
+    """The direction in which a surface bends most, or least, averaged over a length."""
+    bend = curvature(surface).shape_operator.reshape(-1, 9)
+    # Diffused, as the directions of noise are noise.
+    if smoothing:
+        bend = solve(Diffusion(), surface, bend, smoothing**2 / 4).u_end
+    bend = np.asarray(bend, np.float64).reshape(-1, 3, 3)
+    frames = np.asarray(surface.geometry.frames, np.float64)
+    values, vectors = np.linalg.eigh(np.einsum("vac,vcd,vbd->vab", frames, bend, frames))
+    column = np.abs(values).argmax(axis=1) if largest else np.abs(values).argmin(axis=1)
+    chosen = np.take_along_axis(vectors, column[:, None, None], axis=2)[..., 0]
+    return np.einsum("va,vac->vc", chosen, frames)
 
 
 def _flow(table: Table, place) -> np.ndarray | None:
@@ -343,7 +368,9 @@ def _operator(surface: Surface, diffusivity, direction, flow) -> Any:
         field, ratio, _ = direction
         # The mean of both directions is the diffusivity, so that the pattern's scale stays.
         across = 2 / (1 + ratio)
-        tensors = np.asarray(direction_tensor(surface, field, ratio * across, across)) * tensors.reshape(-1, 1, 1)
+        tensors = np.asarray(direction_tensor(surface, field(surface), ratio * across, across)) * tensors.reshape(
+            -1, 1, 1
+        )
     return elliptic_stencil(surface, tensors, None if flow is None else -flow)
 
 
