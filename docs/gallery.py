@@ -48,8 +48,8 @@ def page(texts):
         "# Patterns", "",
         "Each is a file that comes with the package: `ltljax run NAME` makes the picture, with a viewer, data and an",
         "animation; `ltljax new NAME > my.toml` writes the file down, to be changed and run. Add `--mesh my.obj` for",
-        "a surface of your own, as in this picture of zebra, spirals, barrio-spots and gray-scott; and `--set KEY=VALUE` for",
-        "other values. The pictures below are made by `python docs/gallery.py`.", "",
+        "a surface of your own, as in this picture of zebra, spirals, barrio-spots and gray-scott, and",
+        "`--set KEY=VALUE` for other values. The pictures below are made by `python docs/gallery.py`.", "",
         "![Four patterns on a cow, a torus and a rabbit](patterns.png)",
     ]  # fmt: skip
     for name, text in texts.items():

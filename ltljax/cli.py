@@ -1,4 +1,4 @@
-"""The command line: ``ltljax run``, ``ltljax new``, ``ltljax list``, ``ltljax info``."""
+"""The command line: ``ltljax run``, ``ltljax fit``, ``ltljax new``, ``ltljax list``, ``ltljax info``."""
 
 import argparse
 import dataclasses
@@ -11,8 +11,10 @@ from typing import NoReturn
 import jax
 
 from . import scenario
+from .fit import FitError
 from .lifting.schemes import Monotone, Paper, Polynomial, Scheme
 from .mesh import load_mesh
+from .recover import recover
 from .run import run
 from .solve import SolveError
 
@@ -29,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
         return options.command(options)
     except (ValueError, OSError) as error:  # a mesh that is not acceptable is a ValueError too
         return _fail(error, 2)
-    except SolveError as error:
+    except (SolveError, FitError) as error:
         return _fail(error, 1)
     except KeyboardInterrupt:
         print("ltljax: interrupted; what was written so far is kept.", file=sys.stderr)
@@ -80,6 +82,17 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted: the same command, the same --out"
     )
+
+    fit = commands.add_parser("fit", help="find numbers of a scenario file from what was seen")
+    fit.set_defaults(command=_fit)
+    fit.add_argument("scenario", help="a scenario file with a table [fit]; its numbers are the first guess")
+    fit.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
+        help="a value of the file, such as kinetics.feed=0.05; may be given several times",
+    )  # fmt: skip
+    fit.add_argument("--mesh", help="a mesh file, in place of the file's own mesh")
+    fit.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
+    fit.add_argument("--resume", action="store_true", help="go on with a fit that was interrupted: the same --out")
 
     new = commands.add_parser("new", help="print a scenario file to start from: ltljax new gray-scott > my.toml")
     new.set_defaults(command=_new)
@@ -174,6 +187,19 @@ def _run(options: argparse.Namespace) -> int:
         example, record, scheme=_scheme(options.scheme or example.settings.scheme, options.degree), dtype=dtype,
         frames=options.frames or example.frames, out=options.out, resume=options.resume,
     )  # fmt: skip
+    return 0
+
+
+def _fit(options: argparse.Namespace) -> int:
+    jax.config.update("jax_enable_x64", True)
+    path = Path(options.scenario)
+    if path.suffix != ".toml":
+        raise ValueError(f"Expected a scenario file that ends in .toml, found {options.scenario!r}.")
+    changes = dict(scenario.parse_change(change) for change in options.changes)
+    mesh_file = None if options.mesh is None else Path(options.mesh)
+    example = scenario.read(path.read_text(encoding="utf-8"), options.scenario, path.parent, changes, mesh_file)
+    jax.config.update("jax_enable_x64", example.settings.dtype == "float64")
+    recover(example, scheme=_scheme(example.settings.scheme, None), out=options.out, resume=options.resume)
     return 0
 
 

@@ -27,7 +27,8 @@ MAY_IMPORT = {
     "show": {"surface", "solve", "tables", "output"},
     "scenario": {"formulas", "mesh", "lifting", "elliptic", "equations", "operators", "surface", "solve", "output"},
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
-    "cli": {"scenario", "run", "mesh", "lifting", "solve"},
+    "recover": {"scenario", "fit", "lifting", "surface"},
+    "cli": {"scenario", "run", "recover", "fit", "mesh", "lifting", "solve"},
 }
 NO_JAX = ["mesh", "output", "lifting/support.py", "conservation.py", "progress.py"]
 

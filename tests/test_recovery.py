@@ -70,7 +70,7 @@ def test_with_noise_of_one_percent_the_truth_is_in_the_interval(name, where):
     experiment, truth, start, times = PROBLEMS[name](built(where))
     clean = np.asarray(experiment(truth, times).us)
     level = 0.01 * clean.std()
-    inside = {key: 0 for key in truth}
+    inside = dict.fromkeys(truth, 0)
     for seed in range(20):
         values = clean + level * np.random.default_rng(seed).normal(size=clean.shape)
         found = ltl.fit(experiment, start, ltl.Observations(values, level, times), transforms=ltl.Positive())

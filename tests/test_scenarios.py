@@ -1,5 +1,6 @@
 """A scenario file says everything, runs as it says, and a mistake in it is one line that names file, key and cause."""
 
+import json
 import tomllib
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import trimesh
 import ltljax as ltl
 from ltljax import scenario
 from ltljax.cli import main
+from ltljax.output import files
 from ltljax.scenario.written import KINETICS
 
 PLAIN = """
@@ -209,3 +211,123 @@ def test_new_prints_a_file_that_runs(tmp_path, capsys):
     arguments = ["--set", "mesh.subdivisions=2", "--t1", "0.01", "--frames", "1", "--out", str(tmp_path / "out")]
     assert main(["run", str(tmp_path / "my.toml"), *arguments]) == 0
     assert (tmp_path / "out" / "scenario.toml").exists()
+
+
+SOUGHT = """
+[fit]
+free = ["kinetics.a", "diffusivity.v"]
+noise = 0.002
+[[fit.data]]
+file = "early.npz"
+time = 0.05
+[[fit.data]]
+file = "late.npz"
+time = 0.1
+"""
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """What a run of the plain scenario looks like, with a little noise, in the order of the mesh file."""
+    example = scenario.read(PLAIN, "seen", ".")
+    surface = ltl.Surface.from_mesh(example.mesh)
+    us = np.asarray(ltl.solve(example.make_equation(surface), surface, example.u0, 0.1, ts=[0.05, 0.1], rtol=1e-6).us)
+    noise = 0.002 * np.random.default_rng(0).normal(size=us.shape)
+    return example.mesh, (us + noise)[:, np.asarray(example.mesh.source_order)]
+
+
+def keep(kind, folder, name, state, mesh):
+    """A state in a file of a kind; returns what is to be named in the scenario."""
+    path = folder / f"{name}.{kind}"
+    if kind == "npz":
+        np.savez(path, u=state[:, 0], v=state[:, 1])
+    elif kind == "csv":
+        some = np.arange(0, len(state), 3)
+        rows = np.column_stack([some, state[some]])
+        np.savetxt(path, rows, delimiter=",", header="vertex,u,v", comments="", fmt=["%d", "%.9g", "%.9g"])
+    elif kind == "vtp":
+        files.write_vtp(path, mesh.vertices, mesh.faces, dict(u=state[:, 0], v=state[:, 1]))
+    else:
+        rows = "\n".join(
+            " ".join(f"{value:.9g}" for value in (*x, *u)) for x, u in zip(mesh.vertices, state, strict=True)
+        )
+        head = f"ply\nformat ascii 1.0\nelement vertex {len(state)}\n"
+        head += "".join(f"property double {axis}\n" for axis in ("x", "y", "z", "u", "v")) + "end_header\n"
+        path.write_text(head + rows + "\n")
+    return path.name
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv", "vtp", "ply"])
+def test_numbers_of_a_file_are_found_from_files_of_data(kind, seen, tmp_path, capsys):
+    mesh, states = seen
+    text = PLAIN.replace("rate = 30.0", "rate = 30.0\na = 0.13").replace("v = 10.0", "v = 8.0") + SOUGHT
+    for name, state in zip(("early", "late"), states, strict=True):
+        text = text.replace(f"{name}.npz", keep(kind, tmp_path, name, state, mesh))
+    (tmp_path / "mine.toml").write_text(text)
+    out = tmp_path / "out"
+    assert main(["fit", str(tmp_path / "mine.toml"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "The data determine every parameter" in said
+    found = json.loads((out / "fit.json").read_text())
+    for key, truth in (("kinetics.a", 0.1), ("diffusivity.v", 10.0)):
+        assert found["found"][key] == pytest.approx(truth, rel=0.05)
+        assert abs(found["found"][key] - truth) < 3 * found["std"][key]
+    assert found["noise"] == pytest.approx(1, abs=0.15)
+    assert (out / "fit.png").stat().st_size > 10_000
+    assert not (out / "unknowns.npz").exists()
+    fitted = tomllib.loads((out / "fitted.toml").read_text())
+    assert fitted["kinetics"]["a"] == found["found"]["kinetics.a"]
+    assert "fit" not in fitted
+    example = scenario.read((out / "fitted.toml").read_text(), "fitted", out)
+    assert example.wanted is None
+
+
+BROKEN_FITS = {
+    "free unknown": ('"kinetics.a"', '"kinetics.zeta"', "fit.free"),
+    "free twice": ('"kinetics.a", "diffusivity.v"', '"kinetics.a", "kinetics.a"', "each once"),
+    "free a field": ('"kinetics.a"', '"initial.u"', "kinetics.a, kinetics.b"),
+    "free nothing": ('free = ["kinetics.a", "diffusivity.v"]', "free = []", "fit.free"),
+    "negative noise": ("noise = 0.002", "noise = -1", "fit.noise"),
+    "no file": ("early.npz", "nothing.npz", "fit.data.file"),
+    "a file outside": ("early.npz", "../early.npz", "fit.data.file"),
+    "an unknown kind": ("early.npz", "mine.toml", ".npz, .csv, .ply, .vtp"),
+    "times that fall": ("time = 0.05", "time = 0.1", "ascend"),
+    "a time after the end": ("time = 0.05", "time = 0.5", "fit.data.time"),
+    "another key": ("noise = 0.002", "noies = 0.002", "did you mean noise"),
+    "data as a table": ('[[fit.data]]\nfile = "early.npz"\ntime = 0.05\n[[fit.data]]', "[fit.data]", "list of tables"),
+    "wrong length": ("early.npz", "short.npz", "162 finite values of u"),
+    "not a number": ("early.npz", "bad.npz", "162 finite values of u"),
+    "no species": ("early.npz", "other.npz", "columns or arrays named u or v"),
+    "damaged": ("early.npz", "damaged.npz", "a sound file"),
+    "vertex too large": ("early.npz", "far.csv", "vertices from 0 to 161, not 500"),
+    "other species": ("late.npz", "only_u.npz", "of the first file"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_FITS)
+def test_a_broken_fit_is_one_clear_line(name, seen, tmp_path, capsys):
+    mesh, states = seen
+    for stem, state in zip(("early", "late"), states, strict=True):
+        keep("npz", tmp_path, stem, state, mesh)
+    np.savez(tmp_path / "short.npz", u=np.ones(3), v=np.ones(3))
+    np.savez(tmp_path / "bad.npz", u=np.full(162, np.nan), v=np.ones(162))
+    np.savez(tmp_path / "other.npz", w=np.ones(162))
+    np.savez(tmp_path / "only_u.npz", u=np.ones(162))
+    (tmp_path / "damaged.npz").write_bytes(b"PK no zip")
+    (tmp_path / "far.csv").write_text("vertex,u,v\n1,1,1\n500,1,1\n")
+    old, new, message = BROKEN_FITS[name]
+    assert old in SOUGHT
+    (tmp_path / "mine.toml").write_text(PLAIN + SOUGHT.replace(old, new, 1))
+    assert main(["fit", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert message in said.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_without_data_says_what_to_add(tmp_path, capsys):
+    (tmp_path / "mine.toml").write_text(PLAIN)
+    assert main(["fit", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert "no table [fit]" in capsys.readouterr().err
+    assert main(["fit", "gray-scott"]) == 2
+    assert "ends in .toml" in capsys.readouterr().err

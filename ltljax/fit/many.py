@@ -94,10 +94,10 @@ def fit_many(
         loss = 0.5 * jnp.sum(converted(out.value) ** 2)
         return space.params(out.value), loss, out.stats["num_steps"], out.result == optx.RESULTS.successful
 
-    if many is None:
-        whole, along = lambda z: one(z, None), z
-    else:
-        whole, along = lambda values: one(z[0], values), many
+    def whole(given):
+        return one(given, None) if many is None else one(z[0], given)
+
+    along = z if many is None else many
     # With the arrays it reads as leaves: as constants of the program they would be folded, slowly.
     converted = eqx.filter_closure_convert(whole, along[0])
     mapped = eqx.filter_jit(eqx.filter_vmap(lambda converted, one: converted(one), in_axes=(None, 0)))
@@ -147,7 +147,7 @@ def explore(
     least, most = np.asarray(least), np.asarray(most)
     if least.shape != most.shape or not (least < most).all():
         raise ValueError(f"Expected low < high for every parameter, found {low} and {high}.")
-    share = qmc.Sobol(len(least), seed=seed).random(count)
+    share = qmc.Sobol(len(least), rng=seed).random(count)
     in_log = (least > 0) & logarithmic
     safe = np.where(in_log, least, 1.0), np.where(in_log, most, 1.0)
     points = np.where(in_log, safe[0] * (safe[1] / safe[0]) ** share, least + (most - least) * share)

@@ -96,4 +96,5 @@ def _on_surface(axes: Any, fit: Any, data: Observations, surface: Any) -> None:
         drawn.close()
     width = rows[0].shape[1] // 2
     axes.imshow(np.concatenate([row[:, :width] for row in rows], axis=1))
+    axes.set(title="observed, model, and model less observed")
     axes.set_axis_off()

@@ -76,6 +76,15 @@ class Table:
         self.taken[key] = inner.taken
         return inner
 
+    def tables(self, key: str) -> list["Table"]:
+        """The tables of a list of tables; none by default."""
+        value = self._values.get(key, [])
+        if not isinstance(value, list):
+            raise self.error(key, f"a list of tables, [[{self._name(key)}]],")
+        inner = [Table(entry, self._file, self._name(key)) for entry in value]
+        self.taken[key] = [one.taken for one in inner]
+        return inner
+
     def number(self, key: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
         """A finite number."""
         value = self._values.get(key, default)

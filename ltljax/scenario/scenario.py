@@ -11,7 +11,7 @@ import numpy as np
 
 from ..equations import Equation
 from ..mesh import Mesh
-from ..surface import Surface
+from .observed import Wanted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,8 @@ class Scenario:
     Attributes:
         name: its name.
         mesh: where; for files scaled as ``notes`` says.
-        make_equation: the equation, from the surface of the mesh.
+        make_equation: the equation, from the surface of the mesh; with a second argument, numbers by dotted key that
+            replace those of a scenario file.
         u0: the initial state.
         t1: the end of the run.
         parameters: every parameter, for the record.
@@ -85,11 +86,12 @@ class Scenario:
         settings: how it is solved and shown.
         resolved: of a scenario file, all its tables with every value, defaults too.
         files: of a scenario file, the files it names.
+        wanted: of a scenario file with a table ``[fit]``, what is to be found from what was seen.
     """
 
     name: str
     mesh: Mesh
-    make_equation: Callable[[Surface], Equation]
+    make_equation: Callable[..., Equation]
     u0: np.ndarray
     t1: float
     parameters: dict[str, Any]
@@ -103,6 +105,7 @@ class Scenario:
     settings: Settings = Settings()
     resolved: dict[str, Any] | None = None
     files: tuple[Path, ...] = ()
+    wanted: Wanted | None = None
 
 
 def scaled_to_unit_area(mesh: Mesh) -> tuple[Mesh, str]:

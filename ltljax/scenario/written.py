@@ -7,9 +7,10 @@ whose ``resolved`` table holds every value, defaults too.
 import functools
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import diffrax
@@ -25,6 +26,7 @@ from ..operators import curvature
 from ..output.colors import COLORMAPS
 from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface
+from .observed import wanted
 from .paper import parse_condition
 from .reader import ScenarioError, Table, load
 from .scenario import Scenario, Settings, scaled_to_unit_area
@@ -110,13 +112,14 @@ def read(
     seed = root.count("seed", 0, 0, 2**63 - 1)
     mesh, used, note = _mesh(root.table("mesh"), folder)
     place = _places(root.table("bumps"), mesh, seed)
-    make_equation, species = _equation(root, mesh, place)
+    make_equation, species, numbers = _equation(root, mesh, place)
     start, start_file = _start(root.table("initial"), mesh, place, species, folder)
     settings = _settings(root, species)
     time = root.table("time")
     end = time.number("end", 10.0, least=1e-300)
     frames = time.count("frames", 60, 1, 10_000)
     time.finish()
+    sought = wanted(root.table("fit"), numbers, mesh, species, end, folder)
     root.finish()
     if (size := (frames + 1) * start.nbytes) > _MOST_BYTES:
         raise ScenarioError(
@@ -137,7 +140,8 @@ def read(
         frames=frames,
         settings=settings,
         resolved=root.taken,
-        files=tuple(path for path in (used, start_file) if path is not None),
+        files=(*(path for path in (used, start_file) if path is not None), *(sought.files if sought else ())),
+        wanted=sought,
     )
 
 
@@ -227,16 +231,28 @@ class _Written(eqx.Module):
         return tuple(jnp.broadcast_to(f(**{name: known[name] for name in f.names}), u[0].shape) for f in self.formulas)
 
 
-def _named_reaction(table: Table, place) -> tuple[Callable[[Any], kinetics.Kinetics], tuple[str, ...]]:
+# What replaces numbers of the file, by dotted key: the unknowns of a fit.
+_Free = Mapping[str, Any]
+_Reaction = Callable[[Any, _Free], kinetics.Kinetics]
+
+
+def _numbers(prefix: str, values: dict[str, Any]) -> dict[str, float]:
+    """Those that are numbers, by dotted key."""
+    return {f"{prefix}.{key}": float(value) for key, value in values.items() if np.ndim(value) == 0}
+
+
+def _named_reaction(table: Table, place) -> tuple[_Reaction, tuple[str, ...], dict[str, float]]:
     make = KINETICS[table.taken["name"]]
     values = {key: _field(table, key, place, one.default) for key, one in inspect.signature(make).parameters.items()}
     table.finish()
-    return lambda dtype: make(**{key: jnp.asarray(value, dtype) for key, value in values.items()}), make().species
+
+    def reaction(dtype, free):
+        return make(**{key: jnp.asarray(free.get(f"kinetics.{key}", value), dtype) for key, value in values.items()})
+
+    return reaction, make().species, _numbers("kinetics", values)
 
 
-def _written_reaction(
-    table: Table, parameters: Table, place
-) -> tuple[Callable[[Any], kinetics.Kinetics], tuple[str, ...]]:
+def _written_reaction(table: Table, parameters: Table, place) -> tuple[_Reaction, tuple[str, ...], dict[str, float]]:
     rates, names = table.names(), parameters.names()
     for key in rates:
         if not (key.startswith("d") and key[1:].isidentifier()):
@@ -248,28 +264,35 @@ def _written_reaction(
     written = _Written(tuple(table.formula(key, (*species, *names)) for key in rates), species)
     values = {name: _field(parameters, name, place) for name in names}
 
-    def reaction(dtype):
-        return kinetics.Kinetics(written, {name: jnp.asarray(value, dtype) for name, value in values.items()}, species)
+    def reaction(dtype, free):
+        given = {name: jnp.asarray(free.get(f"parameters.{name}", value), dtype) for name, value in values.items()}
+        return kinetics.Kinetics(written, given, species)
 
-    return reaction, species
+    return reaction, species, _numbers("parameters", values)
 
 
-def _cahn_hilliard(table: Table) -> Callable[[Surface], Equation]:
+def _cahn_hilliard(table: Table) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
     width, mobility = table.number("width", 0.05, 1e-6, 1e3), table.number("mobility", 1.0, 0, 1e6)
     table.finish()
-    return lambda surface: CahnHilliard(jnp.asarray(width, surface.dtype), jnp.asarray(mobility, surface.dtype))
+    values = dict(width=width, mobility=mobility)
+
+    def make_equation(surface: Surface, free: _Free = MappingProxyType({})) -> Equation:
+        given = [jnp.asarray(free.get(f"kinetics.{key}", value), surface.dtype) for key, value in values.items()]
+        return CahnHilliard(*given)
+
+    return make_equation, ("u",), _numbers("kinetics", values)
 
 
-def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[[Surface], Equation], tuple[str, ...]]:
+def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
     table, reactions = root.table("kinetics"), root.table("reactions")
     if reactions.names():
         if table.names():
             raise root.error("kinetics", "either [kinetics] with a name or [reactions] with formulas, not both,")
-        reaction, species = _written_reaction(reactions, root.table("parameters"), place)
+        reaction, species, numbers = _written_reaction(reactions, root.table("parameters"), place)
     elif table.choice("name", (*KINETICS, "cahn-hilliard")) == "cahn-hilliard":
-        return _cahn_hilliard(table), ("u",)
+        return _cahn_hilliard(table)
     else:
-        reaction, species = _named_reaction(table, place)
+        reaction, species, numbers = _named_reaction(table, place)
     diffusion = root.table("diffusivity")
     spreads = [_field(diffusion, s, place, 0.0) for s in species]
     for s, spread in zip(species, spreads, strict=True):
@@ -284,14 +307,18 @@ def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[[Surface], Equat
     if any(loop >= len(mesh.boundary_loops) for loop in loops):
         raise boundary.error("conditions", f"conditions for a mesh with {len(mesh.boundary_loops)} boundary loops")
 
-    def make_equation(surface: Surface) -> Equation:
+    def make_equation(surface: Surface, free: _Free = MappingProxyType({})) -> Equation:
+        given = [free.get(f"diffusivity.{s}", d) for s, d in zip(species, spreads, strict=True)]
         spread = [
             _operator(surface, d, direction if direction and s in direction[2] else None, flow)
-            for s, d in zip(species, spreads, strict=True)
+            for s, d in zip(species, given, strict=True)
         ]
-        return ReactionDiffusion(spread, reaction(surface.dtype), boundary=conditions)
+        return ReactionDiffusion(spread, reaction(surface.dtype, free), boundary=conditions)
 
-    return make_equation, species
+    # Operators of directions and flows choose their neighbours on the host, by the diffusivity among others.
+    plain = [s for s in species if flow is None and not (direction and s in direction[2])]
+    numbers |= _numbers("diffusivity", {s: d for s, d in zip(species, spreads, strict=True) if s in plain})
+    return make_equation, species, numbers
 
 
 def _field(table: Table, key: str, place, default: Any = None) -> np.ndarray | float:

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
@@ -28,7 +28,7 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
     """What the steppers share: a recurrence over as many stages as the length of a step needs."""
 
     spectral_bound: eqx.AbstractVar[Callable[..., Float[Array, ""]]]
-    loop_kind: eqx.AbstractVar[str]
+    loop_kind: eqx.AbstractVar[Literal["lax", "checkpointed", "bounded"]]
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation
@@ -116,7 +116,7 @@ class RKL2(_Stabilised):
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
-    loop_kind: str = eqx.field(default="checkpointed", static=True)
+    loop_kind: Literal["lax", "checkpointed", "bounded"] = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
         """Two."""
@@ -150,7 +150,7 @@ class RKL1(_Stabilised):
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
-    loop_kind: str = eqx.field(default="checkpointed", static=True)
+    loop_kind: Literal["lax", "checkpointed", "bounded"] = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
         """One."""

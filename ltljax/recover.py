@@ -1,0 +1,100 @@
+"""A scenario with a table ``[fit]`` becomes the numbers that explain what was seen, and files.
+
+What enters: a `Scenario`. What leaves: a folder with a report, a picture, and the scenario with the numbers found.
+"""
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+
+from .fit import Experiment, Fit, Observations, Positive, fit
+from .lifting.schemes import Scheme
+from .scenario import Scenario
+from .surface import Surface
+
+
+def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = False) -> Fit:
+    """Fit the numbers that a scenario leaves free, and write what was found.
+
+    In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
+    ``fitted.toml``, the scenario with the numbers found, to be run; and while it goes ``unknowns.npz``, to resume from.
+
+    Args:
+        example: the scenario.
+        scheme: of the operators.
+        out: the folder to write to; made if absent.
+        resume: whether to begin with what an interrupted fit left there.
+
+    Raises:
+        ValueError: the scenario has no table ``[fit]``.
+        FitError: the run fails at the first guess.
+    """
+    wanted = example.wanted
+    if wanted is None:
+        raise ValueError(
+            f"{example.name} has no table [fit]: name the numbers to find as free = [...] and files of data as "
+            "[[fit.data]] with file and time."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings(record=True) as cautions:
+        warnings.simplefilter("always")
+        surface = Surface.from_mesh(example.mesh, scheme, example.settings.dtype)
+    for caution in cautions:
+        print(f"note: {caution.message}")
+    settings = example.settings
+    experiment = Experiment(
+        lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
+        solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
+    )  # fmt: skip
+    data = Observations(wanted.values, wanted.noise, wanted.times, wanted.vertices, wanted.species)
+    found = fit(
+        experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
+        checkpoint=out / "unknowns.npz", resume=resume,
+    )  # fmt: skip
+    print(found.summary())
+    files = _write(example, found, surface, out)
+    print(f"written to {out}: {', '.join(files)}")
+    return found
+
+
+def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[str]:
+    numbers = {key: float(value) for key, value in found.params.items()}
+    record: dict[str, Any] = dict(
+        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, reason=found.reason,
+        converged=found.converged, method=found.method,
+    )  # fmt: skip
+    if (known := found.evidence) is not None:
+        low, high = known.intervals
+        record |= dict(
+            std=dict(zip(known.names, known.std.tolist(), strict=True)),
+            confidence=known.confidence,
+            intervals={key: (float(low[key]), float(high[key])) for key in numbers},
+            singular_values=known.singular_values.tolist(),
+            noise=known.noise,
+            cannot_tell=known.cannot_tell,
+        )
+    (out / "fit.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    files = ["fit.json"]
+    tables = json.loads(json.dumps(example.resolved))  # a copy of plain values
+    tables.pop("fit", None)
+    for key, value in numbers.items():
+        table, name = key.split(".")
+        tables[table][name] = value
+    text = tomli_w.dumps({key: value for key, value in tables.items() if value not in ({}, [])})
+    head = "# With the numbers found: ltljax run fitted.toml, beside the files it names\n"
+    (out / "fitted.toml").write_text(head + text, encoding="utf-8")
+    files.append("fitted.toml")
+    try:
+        figure = found.plot(surface if np.ndim(found.residuals) == 3 else None)
+    except ImportError:
+        print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
+    else:
+        figure.savefig(out / "fit.png", dpi=110)
+        files.append("fit.png")
+    (out / "unknowns.npz").unlink(missing_ok=True)
+    return files
