@@ -261,3 +261,62 @@ def test_what_is_not_solvable_is_said(sphere):
         ltl.poisson(sphere, jnp.zeros(7))
     with pytest.raises(ValueError, match="number of modes"):
         ltl.eigenmodes(sphere, 10**6)
+
+
+def test_poisson_counts_fluxes_in_what_is_solvable():
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk())
+    x1 = surface.vertices[:, 0]
+    # Of x^2 + y^2 the Laplacian has a mean, and the flux of 2 through the rim takes it away.
+    squared = jnp.sum(surface.vertices**2, axis=1)
+    found = ltl.poisson(surface, 0 * x1 + 4, ltl.Neumann(2.0))
+    np.testing.assert_allclose(found - found[0], squared - squared[0], atol=1e-2)
+    with pytest.warns(ltl.IncompatibleSourceWarning, match="fluxes included"):
+        ltl.poisson(surface, 0 * x1 + 4, ltl.Neumann(1.0))
+    with pytest.raises(ltl.SolveError, match="source and fluxes have a mean"):
+        ltl.steady_state(ltl.Diffusion(boundary=ltl.Neumann(1.0)), surface, x1)
+
+
+def linear_decay(species, p):
+    return (-p * species[0],)
+
+
+@pytest.mark.parametrize("reacts", [False, True], ids=["Diffusion", "ReactionDiffusion"])
+def test_a_stationary_state_has_the_boundary_data_of_its_time(reacts):
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk(rings=8))
+    x = surface.vertices
+
+    def equation(height):
+        rim = ltl.Dirichlet(lambda t, x: height * (1 + t) * jnp.exp(x[:, 0]))
+        if reacts:
+            return ltl.ReactionDiffusion((1.0,), linear_decay, params=jnp.array(2.0), boundary=rim)
+        return ltl.Diffusion(boundary=rim)
+
+    u0 = jnp.zeros((len(x), 1)) if reacts else jnp.zeros(len(x))
+
+    def total(height):
+        return jnp.sum(ltl.steady_state(equation(height), surface, u0, t=2.0, throw=False))
+
+    at_2, at_0 = (ltl.steady_state(equation(1.0), surface, u0, t=t) for t in (2.0, 0.0))
+    np.testing.assert_allclose(at_2, 3 * at_0, rtol=1e-6)
+    # Both equations are linear in what the rim is held at.
+    np.testing.assert_allclose(jax.jvp(total, (1.0,), (1.0,))[1], jnp.sum(at_2), rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(total)(1.0), jnp.sum(at_2), rtol=1e-6)
+
+
+def test_marching_to_a_stationary_state_has_derivatives_in_both_modes(sphere):
+    def logistic(species, p):
+        return (p * species[0] - species[0] ** 2,)
+
+    def mean(p):
+        equation = ltl.ReactionDiffusion((1.0,), logistic, params=p)
+        start = jnp.full((sphere.num_vertices, 1), 0.3)
+        return jnp.mean(ltl.steady_state(equation, sphere, start, method="marching", t1=100.0, throw=False) ** 2)
+
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(mean)(1.5), 2 * 1.5, rtol=1e-5)
+
+
+def test_a_state_that_grows_for_ever_is_not_called_stationary(sphere):
+    growing = ltl.ReactionDiffusion((1.0,), linear_decay, params=jnp.array(-1.0))
+    with pytest.raises(ltl.SolveError, match="grows for ever"):
+        ltl.steady_state(growing, sphere, jnp.ones((sphere.num_vertices, 1)))

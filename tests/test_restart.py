@@ -1,5 +1,6 @@
 """Runs that are kept on disk go on from there to the same end, whenever they were killed."""
 
+import functools
 import os
 import random
 import signal
@@ -133,6 +134,40 @@ def test_a_fingerprint_is_of_what_a_value_is():
     assert fingerprint(ltl.Diffusion(1.0)) != fingerprint(ltl.Diffusion(2.0))
     assert fingerprint(one) != fingerprint(other)
     assert fingerprint(np.zeros(3)) != fingerprint(np.zeros((3, 1)))
+
+
+RATE = 1.0
+
+
+def reads_a_number_of_its_module(x):
+    return RATE * x
+
+
+def calls_a_function_of_its_module(x):
+    return reads_a_number_of_its_module(x)
+
+
+def test_a_fingerprint_is_of_what_a_function_reads(monkeypatch):
+    before = [fingerprint(f) for f in (reads_a_number_of_its_module, calls_a_function_of_its_module)]
+    assert before == [fingerprint(f) for f in (reads_a_number_of_its_module, calls_a_function_of_its_module)]
+    monkeypatch.setitem(globals(), "RATE", 2.0)
+    after = [fingerprint(f) for f in (reads_a_number_of_its_module, calls_a_function_of_its_module)]
+    assert before[0] != after[0]
+    assert before[1] != after[1]
+
+    def with_default(rate):
+        return lambda x, rate=rate: rate * x
+
+    assert fingerprint(with_default(1.0)) != fingerprint(with_default(2.0))
+    assert fingerprint(functools.partial(max, 1.0)) != fingerprint(functools.partial(max, 2.0))
+    assert fingerprint(lambda x: np.sin(x)) != fingerprint(lambda x: np.cos(x))
+    assert fingerprint(ltl.RKL2()) != fingerprint(ltl.RKL1())
+
+
+def test_a_run_of_no_length_is_kept_too(case, tmp_path):
+    equation, surface, u0 = case
+    found = ltl.solve(equation, surface, u0, 0.0, checkpoint_dir=tmp_path, dt=0.1)
+    np.testing.assert_array_equal(found.u_end, u0)
 
 
 def test_an_overflow_is_kept_and_said_again(case, tmp_path):

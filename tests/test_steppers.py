@@ -1,5 +1,6 @@
 """Steppers: order in time, stability, the maximum principle, and derivatives through all of them."""
 
+import dataclasses
 import sys
 
 import diffrax
@@ -116,9 +117,42 @@ def test_stages_grow_with_the_square_root_of_the_stiffness(sphere, solver):
     assert 8 < counts[1] / counts[0] < 13
 
 
-def test_a_fixed_step_beyond_all_stages_stops_the_run(sphere):
-    with pytest.raises(ltl.SolveError, match="overflowed"):
-        ltl.solve(ltl.Diffusion(1e5), sphere, sphere.vertices[:, 0], 1.0, solver=ltl.RKL2(), dt=1.0)
+def test_a_fixed_step_beyond_all_stages_is_refused(sphere):
+    def end(diffusivity):
+        return ltl.solve(ltl.Diffusion(diffusivity), sphere, sphere.vertices[:, 0], 1.0, solver=ltl.RKL2(), dt=1.0)
+
+    with pytest.raises(ValueError, match="too long for RKL2, which is stable up to"):
+        end(1e5)
+    # Traced, where nothing can be raised, the state says so.
+    assert not jnp.isfinite(jax.jit(lambda d: end(d).u_end)(1e5)).any()
+
+
+def test_a_refused_step_leaves_the_derivative_alone(sphere):
+    rough = jnp.asarray(np.random.default_rng(0).normal(size=sphere.num_vertices))
+    solver = dataclasses.replace(ltl.RKL2(), loop_kind="bounded")
+
+    def after(diffusivity):
+        # A step so long that stages of its length would overflow.
+        begin, end = jnp.zeros(()), jnp.ones(())
+        args = (ltl.Diffusion(diffusivity), sphere)
+        terms = diffrax.ODETerm(lambda t, u, args: args[0].rate(t, args[1], u))
+        state = solver.init(terms, begin, end, rough, args)
+        stepped, error, *_ = solver.step(terms, begin, end, rough, args, state, made_jump=jnp.array(False))
+        is_taken = jnp.isfinite(error).all()
+        return jnp.sum(jnp.where(is_taken, stepped, diffusivity * rough))
+
+    np.testing.assert_allclose(jax.grad(after)(1e9), jnp.sum(rough))
+
+
+@pytest.mark.parametrize("solver", [ltl.BackwardEuler(), ltl.RKL2()], ids=["BackwardEuler", "RKL2"])
+def test_fixed_steps_run_in_float32_whatever_times_are_asked_for(solver):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), dtype=jnp.float32)
+    x1 = surface.vertices[:, 0]
+    times = np.linspace(0, 1, 11)
+    run = ltl.solve(ltl.Diffusion(), surface, x1, 1.0, ts=times, solver=solver, dt=0.01)
+    assert int(run.stats["num_steps"]) == 100
+    assert run.us.dtype == jnp.float32
+    np.testing.assert_allclose(run.us, np.exp(-2 * times)[:, None] * np.asarray(x1), atol=2e-2)
 
 
 @pytest.mark.parametrize("name", ["TRBDF2", "KenCarp3", "Kvaerno5"])
@@ -237,6 +271,8 @@ def test_a_dense_solution_is_known_at_every_time(sphere):
     found = ltl.solve(ltl.Diffusion(), sphere, x1, 1.0, dense=True, max_steps=500, rtol=1e-7, atol=1e-9)
     for t in (0.1, 0.37, 0.9):
         np.testing.assert_allclose(found.at(t), jnp.exp(-2 * t) * x1, atol=2e-2)
+    with pytest.raises(ValueError, match=r"a time from 0 to 1, found 2\.0"):
+        found.at(2.0)
     with pytest.raises(ValueError, match="dense=True"):
         ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
 

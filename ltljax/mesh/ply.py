@@ -35,16 +35,39 @@ class _Element(NamedTuple):
 
 def parse_ply(data: bytes) -> Polygons:
     """PLY, text or binary."""
+    kind, elements, body = _parts(data)
+    if kind == "ascii":
+        return _parse_text(body.decode("utf-8", errors="replace"), elements)
+    return _parse_binary(body, elements, _BYTE_ORDERS[kind])
+
+
+def vertex_properties(data: bytes) -> dict[str, np.ndarray]:
+    """What a PLY file has at its vertices, by name, coordinates included."""
+    kind, elements, body = _parts(data)
+    if not elements or elements[0].name != "vertex" or any(item.size_code for item in elements[0].properties):
+        raise MeshError("expected vertices first, without lists.")
+    element = elements[0]
+    names = [item.name for item in element.properties]
+    if kind == "ascii":
+        lines = [words for line in body.decode("utf-8", errors="replace").splitlines() if (words := line.split())]
+        values = np.array(next_rows(lines, 0, element.rows, element.name), dtype=np.float64)
+        return dict(zip(names, values.T, strict=True))
+    dtype = np.dtype([(item.name, _BYTE_ORDERS[kind] + item.code) for item in element.properties])
+    _expect(body, 0, element.rows * dtype.itemsize, element)
+    rows = np.frombuffer(body, dtype, element.rows)
+    return {name: rows[name].astype(np.float64) for name in names}
+
+
+def _parts(data: bytes) -> tuple[str, list[_Element], bytes]:
+    """The format of a file, its elements, and what follows its head."""
     head, end, body = data.partition(b"end_header")
     if not head.startswith(b"ply") or not end:
         raise MeshError("expected a head from 'ply' to 'end_header'. The file is damaged or not PLY.")
     kind, elements = _parse_head(head.decode("utf-8", errors="replace"))
-    if kind == "ascii":
-        return _parse_text(body.decode("utf-8", errors="replace"), elements)
-    if kind not in _BYTE_ORDERS:
+    if kind != "ascii" and kind not in _BYTE_ORDERS:
         raise MeshError(f"the format {kind!r} is not known. Export as ascii or binary_little_endian.")
     # One line end belongs to the head; the next byte is data, even if it looks like another.
-    return _parse_binary(body[2:] if body[:2] == b"\r\n" else body[1:], elements, _BYTE_ORDERS[kind])
+    return kind, elements, body[2:] if body[:2] == b"\r\n" else body[1:]
 
 
 def _parse_head(head: str) -> tuple[str, list[_Element]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..mesh import Mesh
+from ..mesh.ply import vertex_properties
 from .reader import ScenarioError, Table
 
 
@@ -153,10 +154,7 @@ def _csv(path: Path) -> dict[str, Any]:
 
 
 def _ply(path: Path) -> dict[str, Any]:
-    import trimesh
-
-    rows = trimesh.load(path, process=False).metadata["_ply_raw"]["vertex"]["data"]
-    return {name: rows[name].ravel() for name in rows.dtype.names if name not in "xyz"}
+    return {name: values for name, values in vertex_properties(path.read_bytes()).items() if name not in "xyz"}
 
 
 def _vtp(path: Path) -> dict[str, Any]:

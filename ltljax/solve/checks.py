@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike
 from ..equations import Equation
 from ..surface import Surface
 from ..tables import AnyArray
+from .stabilised import Stabilised
 
 # Products with the rate's derivative from which the stiffest mode is estimated.
 _PRODUCTS = 30
@@ -69,9 +70,17 @@ def finite(equation: Equation, u0: Array) -> None:
 def step(
     equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, dt: float, solver: diffrax.AbstractSolver
 ) -> None:
-    """Raise where steps of an explicit Runge-Kutta method are too long for the stiffest mode of the first state."""
-    leaves = jax.tree.leaves((equation, surface, u0, t0, dt))
-    if not isinstance(solver, diffrax.AbstractERK | diffrax.Euler) or any(isinstance(x, Tracer) for x in leaves):
+    """Raise where steps of an explicit method are too long for the stiffest mode of the first state."""
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, dt))):
+        return
+    if isinstance(solver, Stabilised):
+        bound = float(solver.spectral_bound(jnp.asarray(t0, u0.dtype), u0, (equation, surface)))
+        if dt > (longest := solver.longest_step(bound)):
+            raise ValueError(
+                f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {longest:.2g} with the "
+                "most stages it takes. Take shorter steps, leave dt out for adaptive ones, or use ltl.TRBDF2()."
+            )
+    if not isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
         return
     reach, stiffest = real_stability(solver), _stiffest(equation, surface, u0, jnp.asarray(t0, u0.dtype))
     if dt * stiffest > 1.02 * reach:

@@ -88,6 +88,7 @@ class Solution(eqx.Module):
         stopped: whether ``stop_when`` held.
         interpolation: of a dense solution, from which `at` reads.
         method: the solver, and why it was taken.
+        is_fixed: whether steps were of fixed length.
     """
 
     ts: Float[Array, " T"]
@@ -100,6 +101,7 @@ class Solution(eqx.Module):
     stopped: Array
     interpolation: diffrax.DenseInterpolation | None
     method: str = eqx.field(static=True)
+    is_fixed: bool = eqx.field(static=True)
 
     @property
     def stats(self) -> dict[str, Any]:
@@ -107,15 +109,32 @@ class Solution(eqx.Module):
         return {"solver": self.method, **self.counts}
 
     def at(self, t: ArrayLike) -> Float[Array, "V *S"]:
-        """The state at any time up to ``t_end``, of a solution made with ``dense=True``."""
+        """The state at a time up to ``t_end``, of a solution made with ``dense=True``.
+
+        Between steps it is interpolated, by cubics after explicit steps and linearly after implicit ones; values that
+        conditions hold are then those of the interpolation.
+        """
         if self.interpolation is None:
             raise ValueError("The solution is not dense. Call ltl.solve(..., dense=True, max_steps=...).")
+        if not any(isinstance(x, Tracer) for x in (t, self.t_end)):
+            begin, time, end = float(self.interpolation.t0), np.asarray(t), float(self.t_end)
+            slack = 1e-6 * (end - begin)
+            if not ((time >= begin - slack) & (time <= end + slack)).all():
+                raise ValueError(f"Expected a time from {begin:g} to {end:g}, found {t}.")
         return self.interpolation.evaluate(jnp.asarray(t, self.us.dtype))
 
     def check(self, surface: Surface) -> None:
         """Raise `SolveError`, with causes and cures, where the run did not reach its end."""
         time = float(self.t_end)
         if bool(self.overflowed):
+            if self.is_fixed and not np.isfinite(np.asarray(self.u_end)).all():
+                raise SolveError(
+                    f"The step at t = {time:.4g} could not be made. Causes are (a) a dt beyond what the solver is "
+                    "stable for, (b) an implicit stage whose iteration did not converge, or (c) a state that "
+                    "overflowed. Take a shorter dt, or leave dt out for adaptive steps, which try shorter ones.",
+                    time,
+                    self,
+                )
             raise SolveError(f"The state overflowed at t = {time:.4g}. {_cause_of_overflow(surface)}", time, self)
         if self.result != diffrax.RESULTS.successful and self.result != diffrax.RESULTS.event_occurred:
             raise SolveError(
@@ -183,7 +202,7 @@ def solve(
         stop_when: ``(t, u, rate) -> bool``; the run ends with the first step after which it holds: `Steady`, or your
             own.
         dense: whether to keep every step, so that ``solution.at(t)`` gives the state at any time. Takes the memory of
-            ``max_steps`` states.
+            ``max_steps`` states. Explicit solvers interpolate by cubics, implicit ones linearly.
         preconditioner: what `multigrid` returned for this surface or a similar one, where it is not to be set up anew:
             for surfaces that are being traced.
         checkpoint_dir: a folder in which to keep the state as the run goes. The run is then made of intervals that each
@@ -221,7 +240,7 @@ def solve(
     # As arrays, so that other tolerances need no compiling.
     relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
     if solver is None:
-        method, why = _choice(equation, surface, u0, t0, t1)
+        method, why = _choice(equation, surface, u0, t0, t1, dense)
     else:
         method, why = without_matrices(solver), "chosen by the caller"
     if isinstance(method, SBDF2) and dt is None:
@@ -245,6 +264,8 @@ def solve(
             max_steps, stop_when, dense, name,
         )  # fmt: skip
 
+    if checkpoint_every is not None and not checkpoint_every > 0:
+        raise ValueError(f"Expected a positive length of intervals, found checkpoint_every = {checkpoint_every}.")
     if checkpoint_dir is None:
         solution = advance(u0, t0, t1, times, grid)
     else:
@@ -255,11 +276,13 @@ def solve(
             equation=fingerprint(equation),
             start=fingerprint((u0, float(t0))),  # type: ignore
             end=fingerprint((float(t1), times, dt, checkpoint_every)),  # type: ignore
-            solver=fingerprint((name, rtol, atol, stop_when)),
+            solver=fingerprint((name, solver, rtol, atol, stop_when)),
         )
         keeper = Keeper(checkpoint_dir, run, resume)
-        every = (float(t1) - float(t0)) / _INTERVALS if checkpoint_every is None else checkpoint_every  # type: ignore
-        solution = in_intervals(advance, keeper, u0, float(t0), float(t1), times, grid, every)  # type: ignore
+        # As the steps have them: in the state's float type.
+        begin, end = (float(np.asarray(time, times.dtype)) for time in (t0, t1))
+        every = (end - begin) / _INTERVALS if checkpoint_every is None else checkpoint_every
+        solution = in_intervals(advance, keeper, u0, begin, end, times, grid, every)
     if throw and not isinstance(solution.t_end, Tracer):
         solution.check(surface)
     return solution
@@ -271,7 +294,7 @@ def _bound(equation: Equation, t: Array, surface: Surface, u: Array) -> Array:
 
 
 def _choice(
-    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike, dense: bool
 ) -> tuple[diffrax.AbstractSolver, str]:
     """The solver that is taken where the caller names none, and why."""
     if isinstance(surface.scheme, Paper):
@@ -282,7 +305,8 @@ def _choice(
         return RKL2(), explicit
     span = float(bound) * (float(t1) - float(t0))  # type: ignore
     diffuses = bool(jnp.any(equation.diffusivities(u0) > 0))
-    if span < _STIFF or not diffuses or not equation.is_affine:
+    # Between long implicit steps there are lines only.
+    if span < _STIFF or not diffuses or not equation.is_affine or dense:
         return RKL2(), explicit
     return TRBDF2(), f"implicit, as the run is {span:.1e} times as long as the fastest decay"
 
@@ -308,16 +332,21 @@ def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.nd
         return None
     if any(isinstance(value, Tracer) for value in (t0, t1, ts, dt)):
         raise ValueError("Fixed steps need their times to be known: t0, t1, ts and dt cannot be traced by JAX.")
-    dtype = ts.dtype
-    start, end = float(t0), float(t1)  # type: ignore
-    count = int(np.ceil((end - start) / dt - 1e-9))
-    times = np.concatenate([start + dt * np.arange(count), np.asarray(ts, np.float64), [end]])
-    times = np.unique(times[(times >= start) & (times <= end)])
-    # A time asked for stands in place of the multiple of dt that it is but for rounding.
-    keep = np.concatenate([np.diff(times) > 1e-6 * dt, [True]])
-    keep[0] = True
-    # A run of no length has no steps, whatever theirs.
-    return times[keep].astype(dtype) if keep.sum() > 1 else None
+    start, end = (np.asarray(time, ts.dtype) for time in (t0, t1))
+    if start == end:  # a run of no length has no steps, whatever theirs
+        return None
+    count = int(np.ceil((end - start) / dt - 1e-6))
+    multiples = np.asarray(float(start) + dt * np.arange(1, count), ts.dtype)
+    # What is one time but for rounding is one: the ends first, then what is asked for, then the multiples.
+    least = max(1e-6 * dt, 4 * float(np.finfo(ts.dtype).eps) * float(max(abs(start), abs(end))))
+    grid = np.array([start, end])
+    for times in (np.unique(np.asarray(ts)), multiples):
+        times = times[(times > start) & (times < end)]
+        nearest = np.abs(
+            times[:, None] - grid[np.clip(np.searchsorted(grid, times)[:, None] - [0, 1], 0, len(grid) - 1)]
+        )
+        grid = np.sort(np.concatenate([grid, times[nearest.min(axis=1, initial=np.inf) > least]]))
+    return grid
 
 
 def _warn_of_growth(surface: Surface) -> None:
@@ -402,8 +431,9 @@ def _solve(
     happened = cast(dict[str, Array], out.event_mask)
     stopped = happened.get("stopped", jnp.array(False))
     return Solution(
-        ts, us, t_end[0], u_end[0], counts, out.result, happened["overflowed"], stopped, out.interpolation, method
-    )
+        ts, us, t_end[0], u_end[0], counts, out.result, happened["overflowed"], stopped, out.interpolation, method,
+        grid is not None,
+    )  # fmt: skip
 
 
 def _cause_of_overflow(surface: Surface) -> str:

@@ -4,9 +4,11 @@ What enters: a folder and a description of the run. What leaves: the states kept
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
+import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,37 +30,58 @@ class RestartError(ValueError):
 
 
 def fingerprint(value: Any) -> str:
-    """A short text that differs where the value does: arrays by their bytes, functions by their code."""
+    """A short text that differs where the value does: arrays by their bytes, functions by their code, what that names,
+    and the numbers, arrays and functions of their module that it reads."""
     digest = hashlib.sha256()
-    _feed(digest.update, value)
+    _feed(digest.update, value, set())
     return digest.hexdigest()[:16]
 
 
-def _feed(update: Callable[[bytes], None], value: Any) -> None:
+def _feed(update: Callable[[bytes], None], value: Any, seen: set[int]) -> None:
     if isinstance(value, np.ndarray | jax.Array | np.generic):
         array = np.asarray(value)
         update(f"{array.dtype}{array.shape}".encode())
         update(np.ascontiguousarray(array).tobytes())
     elif isinstance(value, eqx.Module):
         update(type(value).__qualname__.encode())
-        _feed(update, {name: getattr(value, name) for name in value.__dataclass_fields__})
+        _feed(update, {name: getattr(value, name) for name in value.__dataclass_fields__}, seen)
     elif isinstance(value, Mapping):
         for key in sorted(value, key=str):
             update(str(key).encode())
-            _feed(update, value[key])
+            _feed(update, value[key], seen)
     elif isinstance(value, tuple | list):
         update(f"{len(value)} of".encode())
         for part in value:
-            _feed(update, part)
+            _feed(update, part, seen)
+    elif isinstance(value, types.CodeType):
+        update(value.co_code + " ".join(value.co_names).encode())
+        _feed(update, value.co_consts, seen)
+    elif isinstance(value, functools.partial):
+        _feed(update, (value.func, value.args, value.keywords), seen)
+    elif isinstance(value, types.MethodType):
+        _feed(update, (value.__func__, value.__self__), seen)
     elif callable(value):
+        if id(value) in seen:  # functions that name one another
+            return
+        seen.add(id(value))
         code = getattr(value, "__code__", None)
         update(
             f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value).__qualname__)}".encode()
         )
         if code is not None:
-            update(code.co_code)
-            _feed(update, [constant for constant in code.co_consts if isinstance(constant, int | float | str)])
-            _feed(update, [cell.cell_contents for cell in getattr(value, "__closure__", None) or ()])
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            _feed(update, (code, value.__defaults__, value.__kwdefaults__, cells), seen)
+            read = {name: value.__globals__.get(name) for name in code.co_names}
+            plain = int | float | str | np.ndarray | jax.Array | eqx.Module
+            own = {
+                name: found
+                for name, found in read.items()
+                if isinstance(found, plain)
+                or (isinstance(found, types.FunctionType) and found.__module__ == value.__module__)
+            }
+            _feed(update, own, seen)
+        elif not isinstance(value, type):
+            _feed(update, getattr(value, "__dict__", {}), seen)
     else:
         update(repr(value).encode())
 
@@ -164,6 +187,8 @@ def in_intervals(
         grid: the times of fixed steps, or None.
         every: the length of an interval.
     """
+    if t1 == t0:
+        return advance(u0, t0, t1, ts, None)
     asked = np.asarray(ts, np.float64)
     ends = np.unique(np.concatenate([t0 + every * np.arange(1, np.ceil((t1 - t0) / every)), asked, [t1]]))
     if grid is not None:
@@ -189,8 +214,7 @@ def in_intervals(
         states.append(np.asarray(u))
         if is_over:
             break
-    if solution is None:  # a run of no length
-        return advance(u0, t0, t1, ts, None)
+    assert solution is not None  # the last interval is always advanced
     kept = {t0: np.asarray(u0)} | {record["end"]: state for record, state in zip(records, states, strict=True)}
     nearest = [min(kept, key=lambda t, time=time: abs(t - time)) for time in asked]
     reached = [abs(t - time) <= 1e-6 * every and t <= records[-1]["t"] for t, time in zip(nearest, asked, strict=True)]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,7 +25,7 @@ def bound_of_equation(t, u, args):
     return equation.spectral_bound(t, surface, u)
 
 
-class _Stabilised(diffrax.AbstractAdaptiveSolver):
+class Stabilised(diffrax.AbstractAdaptiveSolver):
     """What the steppers share: a recurrence over as many stages as the length of a step needs."""
 
     spectral_bound: eqx.AbstractVar[Callable[..., Float[Array, ""]]]
@@ -50,12 +51,17 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         """One step with as many stages as its length needs."""
         del made_jump
         rate0, evaluations = solver_state
-        dt = t1 - t0
         table = self._coefficients()
         counts = table["stages"]
         table = {name: jnp.asarray(values, y0.dtype) for name, values in table.items()}
-        stiffness = dt * self.spectral_bound(t0, y0, args)
+        bound = self.spectral_bound(t0, y0, args)
         reach = table["reach"]
+        # Beyond the largest number of stages a step would be unstable: an adaptive controller refuses it, and without
+        # one the run stops at what is not a number. Its stages are those of the longest stable step: if they
+        # overflowed, so would derivatives, whatever is made of their values.
+        is_stable = (t1 - t0) * bound <= reach[-1]
+        dt = jnp.where(is_stable, t1 - t0, jax.lax.stop_gradient(reach[-1] / jnp.maximum(bound, 1e-30)))
+        stiffness = dt * bound
         choice = jnp.minimum(jnp.searchsorted(reach, stiffness), len(counts) - 1)
         stages = jnp.asarray(counts)[choice]
         mu, nu, mu_rate, gamma_rate, c = (table[name][choice] for name in ("mu", "nu", "mu_rate", "gamma_rate", "c"))
@@ -63,7 +69,7 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         # Written for the increments over y0: their rounding is relative to the step, not to the state.
         def stage(carry):
             j, before, last = carry
-            rate = terms.vf(t0 + c[j - 1] * (t1 - t0), y0 + last, args)
+            rate = terms.vf(t0 + c[j - 1] * dt, y0 + last, args)
             new = mu[j] * last + nu[j] * before + dt * (mu_rate[j] * rate + gamma_rate[j] * rate0)
             return j + 1, last, new
 
@@ -75,13 +81,14 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
         y1 = y0 + increment
         rate1 = terms.vf(t1, y1, args)
         error = self._error(increment, dt, rate0, rate1)
-        # Beyond the largest number of stages the step would be unstable: an adaptive controller refuses it, and without
-        # one the run stops at what is not a number.
-        is_stable = stiffness <= reach[-1]
         y1, error = jnp.where(is_stable, y1, jnp.nan), jnp.where(is_stable, error, jnp.inf)
         dense = dict(y0=y0, y1=y1, k0=dt * rate0, k1=dt * rate1)
         state = (rate1, evaluations + stages.astype(evaluations.dtype))
         return y1, error, dense, state, diffrax.RESULTS.successful
+
+    def longest_step(self, bound: float) -> float:
+        """The longest stable step where eigenvalues are within a bound."""
+        return float(self._coefficients()["reach"][-1]) / max(bound, 1e-30)
 
     def func(self, terms, t0, y0, args) -> Any:
         """The rate of change."""
@@ -90,14 +97,14 @@ class _Stabilised(diffrax.AbstractAdaptiveSolver):
 
 def differentiable(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
     """The solver with a loop over stages that has the derivatives of the adjoint's loop over steps."""
-    if isinstance(solver, _Stabilised) and isinstance(adjoint, diffrax.ForwardMode):
+    if isinstance(solver, Stabilised) and isinstance(adjoint, diffrax.ForwardMode):
         return dataclasses.replace(solver, loop_kind="lax")
-    if isinstance(solver, _Stabilised) and isinstance(adjoint, diffrax.DirectAdjoint):
+    if isinstance(solver, Stabilised) and isinstance(adjoint, diffrax.DirectAdjoint):
         return dataclasses.replace(solver, loop_kind="bounded")
     return solver
 
 
-class RKL2(_Stabilised):
+class RKL2(Stabilised):
     """Runge-Kutta-Legendre of second order, explicit, adaptive, for ``u_t = f(t, u)`` with a stiff diffusion part.
 
     With s stages it is stable where ``dt * bound <= (s^2 + s - 2) / 2``, bound being that of the eigenvalues of f's
@@ -136,7 +143,7 @@ class RKL2(_Stabilised):
         return (dt * (rate0 + rate1) / 2 - increment) * 2 / 3
 
 
-class RKL1(_Stabilised):
+class RKL1(Stabilised):
     """Runge-Kutta-Legendre of first order: explicit, and with `Monotone` diffusion it keeps the maximum principle.
 
     Stable where ``dt * bound <= s^2 + s``. The error is estimated by the difference from the trapezoidal rule.

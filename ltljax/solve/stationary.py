@@ -32,6 +32,7 @@ from .multigrid import Multigrid
 _INCOMPATIBLE = 1e-2
 _MAX_MARCH = 500
 _MAX_NEWTON = 5
+_GROWN = 1e6
 # Of the steps in time towards a stationary state, in units of the reaction's time.
 _LONGEST = 1e4
 
@@ -104,20 +105,22 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
     tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
     screening = jnp.broadcast_to(jnp.asarray(screening, f.dtype), f.shape[:1])
     start = jnp.zeros_like(f)
-    u, mean, converged, steps = _stationary(equation, surface, start, screening, preconditioner, tolerance)
+    time = jnp.zeros((), f.dtype)
+    u, mean, size, converged, steps = _stationary(equation, surface, start, time, screening, preconditioner, tolerance)
     if not isinstance(u, Tracer):
-        _say_incompatible(mean, f)
+        _say_incompatible(mean, size)
         if throw and not bool(converged):
             raise SolveError(_unconverged(int(steps), preconditioner))
     return u
 
 
-def _say_incompatible(mean: Array, f: Array) -> None:
-    worst, size = float(jnp.max(jnp.abs(mean))), float(jnp.sqrt(jnp.mean(f**2)))
-    if worst > _INCOMPATIBLE * size:
+def _say_incompatible(mean: Array, size: Array) -> None:
+    worst = float(jnp.max(jnp.abs(mean)))
+    if worst > _INCOMPATIBLE * float(size):
         warnings.warn(
-            f"The right side has a mean of {worst:.3g} (its root mean square is {size:.3g}) over a component where "
-            "nothing holds u, so that no solution exists. The equation was solved for the right side without its mean.",
+            f"The right side, fluxes included, has a mean of {worst:.3g} (its root mean square is {float(size):.3g}) "
+            "over a component where nothing holds u, so that no solution exists. The equation was solved for the right "
+            "side without its mean.",
             IncompatibleSourceWarning,
             stacklevel=4,
         )
@@ -130,10 +133,11 @@ def _unconverged(steps: int, preconditioner: Multigrid | None) -> str:
 
 @eqx.filter_jit
 def _stationary(
-    equation: Diffusion, surface: Surface, start: Array, screening: Array, multigrid: Multigrid | None, tolerance: Any
-) -> tuple[Array, Array, Array, Array]:
-    """The u with ``rate(u) = screening u``, the means taken off, whether it was found, and in how many iterations."""
-    time = jnp.zeros((), start.dtype)
+    equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array, multigrid: Multigrid | None,
+    tolerance: Any,
+) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
+    """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes),
+    whether it was found, and in how many iterations."""
     start = equation.held(time, surface, start)
     trailing = (1,) * (start.ndim - 1)
     is_held = bounds.held_vertices(surface, equation.conditions)
@@ -172,7 +176,11 @@ def _stationary(
     u = start + found.value - jnp.where(
         is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
     )  # fmt: skip
-    return u, constants * scale * diffusivities, found.result == lx.RESULTS.successful, found.stats["num_steps"]
+    load = rate(equation.held(time, surface, jnp.zeros_like(start)))
+    # With what rounding leaves of a mean that is none.
+    rounding = 1e3 * jnp.finfo(start.dtype).eps / _INCOMPATIBLE
+    size = jnp.sqrt(jnp.mean(load**2)) + rounding * jnp.sqrt(jnp.mean(value**2))
+    return u, constants * scale * diffusivities, size, found.result == lx.RESULTS.successful, found.stats["num_steps"]
 
 
 def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum) -> Array:
@@ -227,16 +235,17 @@ def steady_state(
         return _steady_diffusion(equation, surface, u0, time, preconditioner, throw)
     if method == "marching":
         stopping = Steady(min(1e-4, 1e3 * tolerance))
-        u0 = solve(equation, surface, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
-    u, rate, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
-    if throw and not isinstance(u, Tracer):
-        wanted = tolerance * float(jnp.sqrt(jnp.mean(u**2)))
-        if not float(rate) <= max(10 * wanted, 1e3 * float(jnp.finfo(u.dtype).eps) * float(spectral_bound(surface))):
-            raise SolveError(
-                f"No stationary state was found: after {int(steps)} steps the rate is {float(rate):.2g}, expected at "
-                f"most {wanted:.2g}. Causes are (a) a state that oscillates or travels for ever, (b) a start too far "
-                'away: try method="marching", or (c) a tolerance beyond the float type.'
-            )
+        # The way there has no part in the derivative, and forward mode would not go through it.
+        numbers, rest = eqx.partition((equation, surface, u0), eqx.is_inexact_array)
+        still, where, u0 = eqx.combine(jax.lax.stop_gradient(numbers), rest)
+        u0 = solve(still, where, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
+    u, rate, wanted, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
+    if throw and not isinstance(u, Tracer) and not float(rate) <= float(wanted):
+        raise SolveError(
+            f"No stationary state was found: after {int(steps)} steps the rate is {float(rate):.2g}, expected at "
+            f"most {float(wanted):.2g}. Causes are (a) a state that oscillates, travels or grows for ever, (b) a start "
+            'too far away: try method="marching", or (c) a tolerance beyond the float type.'
+        )
     return u
 
 
@@ -246,15 +255,14 @@ def _steady_diffusion(equation: Diffusion, surface: Surface, u0: Array, time: Ar
     still = eqx.tree_at(lambda e: e.source, equation, source, is_leaf=lambda x: x is None)
     none = jnp.zeros(surface.num_vertices, u0.dtype)
     tolerance = 1e-11 if u0.dtype == jnp.float64 else 1e-5
-    u, mean, converged, steps = _stationary(still, surface, u0, none, preconditioner, tolerance)
+    u, mean, size, converged, steps = _stationary(still, surface, u0, time, none, preconditioner, tolerance)
     if not isinstance(u, Tracer) and throw:
         if not bool(converged):
             raise SolveError(_unconverged(int(steps), preconditioner))
-        size = float(jnp.sqrt(jnp.mean(source**2)))
-        if float(jnp.max(jnp.abs(mean))) > _INCOMPATIBLE * max(size, 1e-30):
+        if float(jnp.max(jnp.abs(mean))) > _INCOMPATIBLE * float(size):
             raise SolveError(
-                f"There is no stationary state: the source has a mean of {float(jnp.max(jnp.abs(mean))):.3g} and "
-                "nothing takes it away, so that u grows for ever. Take the mean off, or hold u on a boundary."
+                f"There is no stationary state: source and fluxes have a mean of {float(jnp.max(jnp.abs(mean))):.3g} "
+                "and nothing takes it away, so that u grows for ever. Take the mean off, or hold u on a boundary."
             )
     conserved = surface.mass if isinstance(surface.scheme, Monotone) and not surface.is_traced else surface.vertex_areas
     has_conditions = any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions)
@@ -277,8 +285,14 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
     def rms(u):
         return jnp.sqrt(jnp.mean(u**2))
 
+    is_held = bounds.held_vertices(surface, equation.conditions).reshape(-1, *(1,) * (u0.ndim - 1))
+
     def rate(u):
-        return equation.rate(time, surface, u)
+        # What is held returns to its value, which makes the system regular and lets derivatives see the data.
+        return jnp.where(is_held, equation.held(time, surface, u) - u, equation.rate(time, surface, u))
+
+    # A state that grew this much has no end to its growth.
+    largest = _GROWN * jnp.maximum(rms(u0), 1)
 
     dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, 1e-6))
 
@@ -302,7 +316,7 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
 
     def goes_on(carry):
         u, value, _, steps = carry
-        return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH)
+        return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH) & (rms(u) <= largest)
 
     frozen = jax.lax.stop_gradient((u0, rate(u0), dt0))
     u, _, _, steps = jax.lax.while_loop(goes_on, march, (*frozen, jnp.zeros((), jnp.int32)))
@@ -326,4 +340,8 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
     is_better = rms(rate(found.value)) <= rms(rate(u))
     best = jax.lax.stop_gradient(jnp.where(is_better, found.value, u))
     best = best + (found.value - jax.lax.stop_gradient(found.value))
-    return best, rms(rate(best)), steps
+    best = equation.held(time, surface, best)
+    # Ten times the goal, or what rounding leaves of the rate of such a state.
+    rounding = 20 * jnp.finfo(u.dtype).eps * equation.spectral_bound(time, surface, best)
+    wanted = jnp.where(rms(best) <= largest, jnp.maximum(10 * tolerance, rounding) * rms(best), 0)
+    return best, rms(rate(best)), wanted, steps
