@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import optimistix as optx
 import pytest
 from jax.test_util import check_grads
@@ -64,6 +65,18 @@ def test_rates_are_recovered_from_clean_snapshots(rates, method):
     assert found.converged
     assert relative(found.params, TRUTH) < 1e-3
     assert found.losses[-1] < 1e-4 * found.losses[0]
+
+
+def test_an_optimiser_of_optax_serves_as_method(rates):
+    experiment, clean = rates
+    values, level = noisy(np.asarray(clean), 0.01, 0)
+    start = {key: 1.02 * value for key, value in TRUTH.items()}
+    data = ltl.Observations(values, level, TIMES)
+    with jax.numpy_dtype_promotion("standard"):  # which optax counts on
+        found = ltl.fit(experiment, start, data, transforms=ltl.Positive(), method=optax.adam(5e-3), max_steps=60)
+    assert found.method.startswith("optax")
+    assert found.loss < 0.01 * found.losses[0]
+    assert relative(found.params, TRUTH) < 0.01
 
 
 def test_intervals_hold_what_noise_hides_and_the_noise_is_estimated(rates):
@@ -435,6 +448,9 @@ def test_a_right_gradient_passes_and_a_wrong_one_is_named(sphere):
     assert not wrong.passed
     assert "wrong: slope 1.0" in str(wrong)
     assert "linear" in ltl.check_gradient(lambda p: 3 * p["a"].sum(), dict(a=np.arange(3.0))).verdict
+    slightly = ltl.check_gradient(lambda p: jnp.sin(p) + 1e-3 * jax.lax.stop_gradient(p), 1.0)
+    assert not slightly.passed
+    assert "right to 0.2 %, no better" in slightly.verdict
     rounded = ltl.check_gradient(lambda p: jnp.sin(p) + 1e-4 * jnp.sin(1e7 * jax.lax.stop_gradient(p)), 1.0)
     assert "noisy" in rounded.verdict
     with pytest.raises(ValueError, match="one finite number"):

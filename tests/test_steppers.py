@@ -207,6 +207,39 @@ def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name
         assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
 
 
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name):
+    solver, how = GRADIENTS[name]
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk(rings=6))
+    x = surface.vertices
+    hierarchy = ltl.multigrid(surface)
+
+    @jax.jit
+    def loss(parameters):
+        # A logistic reaction, its rate a field, with values held on one side and a flux through the other.
+        conditions = (
+            ltl.Neumann(parameters["flux"] * jnp.sin(x[:, 1])),
+            ltl.Dirichlet(parameters["values"], where=lambda x: x[:, 0] > 0.2),
+        )
+        equation = ltl.ReactionDiffusion(
+            (0.1,), lambda species, rate: (rate * species[0] * (1 - species[0]),),
+            params=parameters["rate"], boundary=conditions,
+        )  # fmt: skip
+        how_exactly = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
+        end = ltl.solve(equation, surface, 0.2 + 0 * x[:, :1], 1.0, solver=solver, **how_exactly).us[-1]
+        return jnp.sum(end[:, 0] ** 2 * jnp.cos(x[:, 0]))
+
+    random = np.random.default_rng(0)
+    field = jnp.asarray(random.uniform(size=surface.num_vertices))
+    at = dict(values=0.3 + field, flux=jnp.array(0.5), rate=1 + field)
+    value, gradient = jax.jit(jax.value_and_grad(loss))(at)
+    for key, direction in dict(values=0.5 * field, flux=jnp.array(0.5), rate=field).items():
+        slope = jnp.sum(gradient[key] * direction)
+        assert abs(slope) > 1e-3
+        rest = [abs(loss({**at, key: at[key] + h * direction}) - value - h * slope) for h in (0.1, 0.01)]
+        assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
+
+
 def test_a_source_field_is_differentiated_in_forward_and_reverse(sphere):
     x1 = sphere.vertices[:, 0]
 

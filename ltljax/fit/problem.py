@@ -215,9 +215,8 @@ def prepare(
                 )
             reverse, how = True, f"its Jacobian in reverse mode, {num_residuals} rows"
         return Problem(plain, solver, reverse, f"{name}, {how}")
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if takes_adjoint else None
     return Problem(
-        dataclasses.replace(plain, adjoint=adjoint), solver, True,
+        dataclasses.replace(plain, adjoint=None), solver, True,
         f"{name}, gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}",
     )  # fmt: skip
 

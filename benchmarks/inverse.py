@@ -1,0 +1,179 @@
+"""What inverse problems cost: gradients over forward runs, solves to converge beside SciPy, many starts at once.
+
+python benchmarks/inverse.py [--parts gradient solves starts]
+
+Gradients are of the mean square of a final state with respect to a source field, Schnakenberg's reaction and fixed
+steps of the default solver, by recursive checkpointing (the default adjoint). Times are medians of the second call on,
+forward and gradient in turns; memory is what XLA reserves beside arguments and results. SciPy's `least_squares` takes
+finite differences of the same compiled model.
+"""
+
+import argparse
+import time
+import warnings
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from jax.flatten_util import ravel_pytree  # noqa: E402
+from scipy import optimize  # noqa: E402
+
+import ltljax as ltl  # noqa: E402
+
+# Level of the icosphere, steps, unknowns (None: one for each vertex and species).
+RUNS = (
+    (5, 250, None), (5, 1000, None), (5, 4000, None), (5, 8000, None),
+    (5, 1000, 1), (5, 1000, 100), (4, 1000, None), (6, 1000, None),
+)  # fmt: skip
+ROUNDS = 5
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", default=tuple(PARTS), choices=sorted(PARTS))
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    for part in arguments.parts:
+        PARTS[part]()
+
+
+def start_of(surface):
+    x = np.asarray(surface.vertices)
+    push = np.sin(5 * x[:, 0]) * np.cos(4 * x[:, 1]) + np.sin(6 * x[:, 2])
+    return jnp.asarray(np.array([1.0, 0.9]) + 0.05 * push[:, None] * np.array([1.0, -1.0]))
+
+
+def gradient():
+    print(
+        "### A gradient over a forward run\n\n"
+        "| vertices | steps | unknowns | forward (s) | gradient (s) | ratio | forward (MB) | gradient (MB) | "
+        "compile (s) |\n" + "| --- " * 9 + "|"
+    )
+    for level, steps, unknowns in RUNS:
+        surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
+        u0, dt = start_of(surface), 2e-4
+        size = surface.num_vertices if unknowns is None else unknowns
+        # Unknowns are the values of a field that is constant over runs of vertices.
+        owner = np.arange(surface.num_vertices) * size // surface.num_vertices
+
+        def loss(field, surface, u0, owner=owner, dt=dt, steps=steps):
+            a = jnp.take(field, owner)
+            equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(a, 0.9, rate=30.0))
+            return jnp.mean(ltl.solve(equation, surface, u0, steps * dt, solver=ltl.RKL2(), dt=dt).u_end ** 2)
+
+        field = jnp.full(size, 0.1)
+        begin = time.perf_counter()
+        forward = jax.jit(loss).lower(field, surface, u0).compile()
+        reverse = jax.jit(jax.value_and_grad(loss)).lower(field, surface, u0).compile()
+        compiling = time.perf_counter() - begin
+        seconds = {forward: [], reverse: []}
+        for _ in range((2 if steps > 1000 else ROUNDS) + 1):
+            for run, found in seconds.items():
+                begin = time.perf_counter()
+                jax.block_until_ready(run(field, surface, u0))
+                found.append(time.perf_counter() - begin)
+        there, back = (float(np.median(found[1:])) for found in seconds.values())
+        memory = [run.memory_analysis().temp_size_in_bytes / 1e6 for run in seconds]
+        print(
+            f"| {surface.num_vertices} | {steps} | {size} | {there:.2f} | {back:.2f} | {back / there:.2f} | "
+            f"{memory[0]:.1f} | {memory[1]:.1f} | {compiling:.1f} |",
+            flush=True,
+        )
+
+
+def eight_unknowns():
+    """Schnakenberg's rates, diffusivities and a rate that varies in space: model, truth, first guess, times."""
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
+    x = surface.vertices
+
+    def equation(p):
+        kinetics = ltl.kinetics.schnakenberg(p["a"], p["b"] * jnp.exp(x @ p["tilt"]), rate=p["rate"])
+        return ltl.ReactionDiffusion((p["du"], p["dv"]), kinetics)
+
+    truth = dict(a=0.1, b=0.9, du=1.0, dv=10.0, rate=30.0, tilt=np.array([0.1, -0.05, 0.02]))
+    start = dict(a=0.12, b=0.8, du=1.2, dv=8.5, rate=27.0, tilt=np.zeros(3))
+    return ltl.Experiment(equation, surface, start_of(surface)), truth, start, np.array([0.1, 0.25, 0.5])
+
+
+def solves():
+    experiment, truth, start, times = eight_unknowns()
+    data = ltl.Observations(experiment(truth, times).us, times=times)
+    rows = []
+    for label in ("first call", "second call"):
+        begin = time.perf_counter()
+        found = ltl.fit(experiment, start, data)
+        rows.append(("ltljax, Levenberg-Marquardt", label, found.num_steps, time.perf_counter() - begin, found.params))
+    flat, rebuild = ravel_pytree(jax.tree.map(jnp.asarray, start))
+    residuals = jax.jit(lambda z: data.misfit(experiment(rebuild(z), times)))
+    np.asarray(residuals(flat))
+    for method in ("trf", "lm"):
+        count = 0
+
+        def counted(z):
+            nonlocal count
+            count += 1
+            return np.asarray(residuals(z))
+
+        begin = time.perf_counter()
+        theirs = optimize.least_squares(
+            counted, np.asarray(flat), x_scale=np.maximum(np.abs(flat), 0.1), xtol=1e-8, method=method
+        )
+        rows.append(
+            (f"SciPy, {method}", "compiled before", count, time.perf_counter() - begin, rebuild(jnp.asarray(theirs.x)))
+        )
+    wanted = np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, truth))[0])
+    print(
+        "\n### Eight unknowns of Schnakenberg's reaction from three snapshots, 642 vertices\n\n"
+        "| method | | runs of the model | seconds | largest error |\n| --- | --- | --- | --- | --- |"
+    )
+    for name, label, count, seconds, params in rows:
+        off = np.abs(np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, params))[0]) - wanted)
+        print(f"| {name} | {label} | {count} | {seconds:.1f} | {np.max(off / np.maximum(np.abs(wanted), 1)):.1e} |")
+    ours, theirs = rows[1], rows[2]
+    print(
+        f"\nSciPy over ltljax: {theirs[2] / ours[2]:.1f} times the runs, {theirs[3] / ours[3]:.1f} times the seconds."
+    )
+
+
+def starts():
+    print(
+        "\n### 32 starts: `fit_many` against a loop of `fit`\n\n"
+        "| vertices | at once (s) | loop (s) | ratio | first call at once (s) |\n| --- | --- | --- | --- | --- |"
+    )
+    random = np.random.default_rng(0)
+    for level in (2, 3, 4):
+        surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
+
+        def equation(p):
+            return ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0))
+
+        experiment = ltl.Experiment(equation, surface, start_of(surface))
+        truth, times = dict(a=0.1, b=0.9, d=10.0), np.array([0.1, 0.25])
+        data = ltl.Observations(experiment(truth, times).us, times=times)
+        many = {key: value * random.uniform(0.7, 1.3, 32) for key, value in truth.items()}
+        seconds = []
+        for _ in range(2):
+            begin = time.perf_counter()
+            found = ltl.fit_many(experiment, many, data, transforms=ltl.Positive())
+            jax.block_until_ready(found.losses)
+            seconds.append(time.perf_counter() - begin)
+        assert np.allclose(np.asarray(found.params["a"]), 0.1, rtol=1e-3)
+        ltl.fit(experiment, {key: float(values[0]) for key, values in many.items()}, data, transforms=ltl.Positive())
+        begin = time.perf_counter()
+        for k in range(32):
+            one = {key: float(values[k]) for key, values in many.items()}
+            ltl.fit(experiment, one, data, transforms=ltl.Positive())
+        loop = time.perf_counter() - begin
+        print(
+            f"| {surface.num_vertices} | {seconds[1]:.1f} | {loop:.1f} | {loop / seconds[1]:.2f} | {seconds[0]:.1f} |",
+            flush=True,
+        )
+
+
+PARTS = {"gradient": gradient, "solves": solves, "starts": starts}
+
+if __name__ == "__main__":
+    main()
