@@ -95,7 +95,8 @@ def eight_unknowns():
 
     truth = dict(a=0.1, b=0.9, du=1.0, dv=10.0, rate=30.0, tilt=np.array([0.1, -0.05, 0.02]))
     start = dict(a=0.12, b=0.8, du=1.2, dv=8.5, rate=27.0, tilt=np.zeros(3))
-    return ltl.Experiment(equation, surface, start_of(surface)), truth, start, np.array([0.1, 0.25, 0.5])
+    experiment = ltl.Experiment(equation, surface, start_of(surface), max_steps=2000)
+    return experiment, truth, start, np.array([0.1, 0.25, 0.5])
 
 
 def solves():
@@ -107,7 +108,8 @@ def solves():
         found = ltl.fit(experiment, start, data)
         rows.append(("ltljax, Levenberg-Marquardt", label, found.num_steps, time.perf_counter() - begin, found.params))
     flat, rebuild = ravel_pytree(jax.tree.map(jnp.asarray, start))
-    residuals = jax.jit(lambda z: data.misfit(experiment(rebuild(z), times)))
+    # A run that diverges is far from the data, as it is for ltljax.
+    residuals = jax.jit(lambda z: jnp.nan_to_num(data.misfit(experiment(rebuild(z), times)), nan=1e8))
     np.asarray(residuals(flat))
     for method in ("trf", "lm"):
         count = 0
@@ -118,8 +120,9 @@ def solves():
             return np.asarray(residuals(z))
 
         begin = time.perf_counter()
+        scale = np.maximum(np.abs(flat), 0.1)
         theirs = optimize.least_squares(
-            counted, np.asarray(flat), x_scale=np.maximum(np.abs(flat), 0.1), xtol=1e-8, method=method
+            counted, np.asarray(flat), x_scale=scale, xtol=1e-8, method=method, max_nfev=1000
         )
         rows.append(
             (f"SciPy, {method}", "compiled before", count, time.perf_counter() - begin, rebuild(jnp.asarray(theirs.x)))
@@ -144,7 +147,7 @@ def starts():
         "| vertices | at once (s) | loop (s) | ratio | first call at once (s) |\n| --- | --- | --- | --- | --- |"
     )
     random = np.random.default_rng(0)
-    for level in (2, 3, 4):
+    for level in (2,):
         surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
 
         def equation(p):

@@ -1,8 +1,9 @@
 """The figures of identifiability.md: what data tell about parameters, and what they do not.
 
-python docs/identifiability.py
+python docs/identifiability.py [PART ...]
 """
 
+import sys
 import warnings
 
 import jax
@@ -30,11 +31,10 @@ def noisy(values, share=0.01, seed=1):
 
 
 def schnakenberg(u0=U0):
-    return ltl.Experiment(
-        lambda p: ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0)),
-        SURFACE,
-        u0,
-    )
+    def equation(p):
+        return ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0))
+
+    return ltl.Experiment(equation, SURFACE, u0)
 
 
 def say(title, found):
@@ -56,7 +56,7 @@ def one_scale():
 
     truth = dict(du=1.0, dv=10.0, rate=30.0)
     data = ltl.Observations(*noisy(model(jax.tree.map(jnp.asarray, truth))))
-    found = ltl.fit(model, dict(du=1.05, dv=10.3, rate=30.5), data, transforms=ltl.Positive())
+    found = ltl.fit(model, dict(du=1.05, dv=10.3, rate=30.5), data, transforms=ltl.Positive(), max_steps=30)
     say("one picture of a pattern that has become stationary", found)
 
 
@@ -71,10 +71,10 @@ def uniform_start():
 
 def too_late():
     """The first guess makes another pattern, and no small change of rates turns its spots into those that were seen."""
-    experiment, times = schnakenberg(), np.array([4.0])
+    experiment, times = schnakenberg(), np.array([2.0])
     data = ltl.Observations(*noisy(experiment(TRUTH, times).us), times)
     say("one late picture, from a first guess 30 % off", ltl.fit(
-        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.Positive()
+        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.Positive(), max_steps=40
     ))  # fmt: skip
 
 
@@ -125,7 +125,12 @@ def dead_ends():
     print()
 
 
+PARTS = dict(
+    growing_pattern=growing_pattern, one_scale=one_scale, uniform_start=uniform_start, too_late=too_late,
+    faded=faded, dead_ends=dead_ends,
+)  # fmt: skip
+
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    for part in (growing_pattern, one_scale, uniform_start, too_late, faded, dead_ends):
-        part()
+    for part in sys.argv[1:] or PARTS:
+        PARTS[part]()

@@ -142,6 +142,23 @@ def test_what_data_cannot_tell_is_named(sphere):
     assert "determine every parameter" in known.summary()
 
 
+def test_a_model_that_does_not_explain_the_data_is_said_not_to():
+    x = np.linspace(0, 1, 50)
+    found = ltl.fit(lambda p: p["slope"] * x, dict(slope=1.0), ltl.Observations(x**2 + 1, 0.01))
+    assert "does not explain the data" in found.summary()
+    assert "determine every parameter" not in found.summary()
+
+
+def test_the_length_of_steps_is_no_information(sphere):
+    """A uniform mixture says nothing of diffusion, though the first step is as long as diffusion allows."""
+    u0 = np.array([1.5, 0.5]) + 0 * bumpy(sphere)[:, None]
+    experiment = ltl.Experiment(schnakenberg(sphere).equation, sphere, u0)
+    data = ltl.Observations(experiment(TRUTH, TIMES).us, 1e-3, TIMES)
+    found = ltl.fit(experiment, AWAY, data, transforms=ltl.Positive())
+    assert found.singular_values[-1] < 1e-6 * found.singular_values[0]
+    assert "d alone" in found.summary()
+
+
 def test_a_profile_is_least_at_the_optimum_and_ends_the_interval(rates):
     experiment, clean = rates
     values, level = noisy(clean, 0.02, 1)

@@ -16,6 +16,8 @@ from .unknowns import Unknowns
 _UNSEEN = 1e-3
 # One standard deviation, relative, from which on a direction counts as not determined.
 _VAGUE = 0.5
+# Residuals that are so many times the noise are not noise.
+_UNEXPLAINED = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,5 +141,11 @@ def summary(fit: Any, data: Observations) -> str:
         unit = "estimated noise" if data.noise is None else "residuals over noise (1 if model and noise are right)"
         lines.append(f"{unit}: {known.noise:.3g}")
         lines.append("singular values: " + ", ".join(f"{value:.3g}" for value in known.singular_values))
-        lines += known.cannot_tell or ["The data determine every parameter."]
+        if data.noise is not None and known.noise > _UNEXPLAINED:
+            lines.append(
+                f"The model does not explain the data: what remains is {known.noise:.2g} times the noise, and the "
+                "intervals mean nothing. Begin elsewhere (ltl.explore, ltl.fit_many), or doubt the model or the noise."
+            )
+        else:
+            lines += known.cannot_tell or ["The data determine every parameter."]
     return "\n".join(lines)

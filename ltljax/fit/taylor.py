@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-
 # A gradient that errs by less than this share errs as adaptive steps do, not as a mistake does.
 _NEARLY = 1e-2
 
@@ -105,9 +104,9 @@ def _verdict(slope: float, derivative: float, share: float) -> str:
         return f"In doubt: slope {slope:.2f} instead of 2. Take a smaller step=, or tighter tolerances."
     if slope > 0.7 and share < _NEARLY:
         return (
-            f"The gradient is right to {100 * share:.1g} %, no better: slope {slope:.2f} instead of 2. Adaptive steps are "
-            "differentiated as if their lengths did not depend on the parameters: tighten rtol and atol, or give dt= "
-            "for fixed steps."
+            f"The gradient is right to {100 * share:.1g} %, no better: slope {slope:.2f} instead of 2. Adaptive steps "
+            "are differentiated as if their lengths did not depend on the parameters: tighten rtol and atol, or give "
+            "dt= for fixed steps."
         )
     if slope > 0.7:
         return (
