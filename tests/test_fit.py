@@ -155,7 +155,7 @@ def test_the_length_of_steps_is_no_information(sphere):
     experiment = ltl.Experiment(schnakenberg(sphere).equation, sphere, u0)
     data = ltl.Observations(experiment(TRUTH, TIMES).us, 1e-3, TIMES)
     found = ltl.fit(experiment, AWAY, data, transforms=ltl.Positive())
-    assert found.singular_values[-1] < 1e-6 * found.singular_values[0]
+    assert found.singular_values[-1] < 1e-3 * found.singular_values[0]
     assert "d alone" in found.summary()
 
 

@@ -13,7 +13,7 @@ from .unknowns import Unknowns
 
 # A direction along which doubling the parameters changes the predictions by less than this share of their spread is not
 # told from zero: time stepping itself errs by as much.
-_UNSEEN = 1e-3
+_UNSEEN = 5e-3
 # One standard deviation, relative, from which on a direction counts as not determined.
 _VAGUE = 0.5
 # Residuals that are so many times the noise are not noise.

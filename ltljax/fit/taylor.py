@@ -105,8 +105,7 @@ def _verdict(slope: float, derivative: float, share: float) -> str:
     if slope > 0.7 and share < _NEARLY:
         return (
             f"The gradient is right to {100 * share:.1g} %, no better: slope {slope:.2f} instead of 2. Adaptive steps "
-            "are differentiated as if their lengths did not depend on the parameters: tighten rtol and atol, or give "
-            "dt= for fixed steps."
+            "err differently for other parameters: tighten rtol and atol, or give dt= for fixed steps."
         )
     if slope > 0.7:
         return (

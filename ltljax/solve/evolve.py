@@ -419,8 +419,6 @@ def _solve(
         bound = equation.spectral_bound(t0, surface, u0)
         # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
         dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), t1 - t0)
-        # All lengths are multiples of it, and derivatives are not to see steps err more as parameters lengthen them.
-        dt0 = jax.lax.stop_gradient(dt0)
         if isinstance(solver, ImplicitRungeKutta):  # whose interpolation is linear
             controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
     keeps_state = hasattr(solver, "spectral_bound")
