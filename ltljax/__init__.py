@@ -58,7 +58,7 @@ from .operators import (
     spectral_bound,
     weighted_laplacian,
 )
-from .show import plot, plot_dispersion, view
+from .show import displaced, plot, plot_dispersion, view
 from .solve import (
     RKL1,
     RKL2,
@@ -140,6 +140,7 @@ __all__ = [
     "curvature",
     "direction_tensor",
     "dispersion",
+    "displaced",
     "divergence",
     "eigenmodes",
     "elliptic_stencil",

@@ -3,10 +3,11 @@
 import argparse
 import dataclasses
 import difflib
+import io
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jax
 
@@ -26,11 +27,17 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0, 1 for a run that failed, 2 for a wrong argument."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what a terminal cannot show it shows by number
+            stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
     try:
         return options.command(options)
     except (ValueError, OSError) as error:  # a mesh that is not acceptable is a ValueError too
         return _fail(error, 2)
+    except MemoryError as error:
+        said = f" ({error})" if str(error) else ""
+        return _fail(MemoryError(f"The memory does not suffice{said}. Take fewer frames, or a coarser mesh."), 2)
     except (SolveError, FitError) as error:
         return _fail(error, 1)
     except KeyboardInterrupt:
@@ -39,7 +46,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fail(error: Exception, code: int) -> int:
-    print(f"ltljax: {' '.join(str(error).split())}", file=sys.stderr)
+    line = " ".join(str(error).split())
+    # Control characters would speak to the terminal.
+    line = "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in line)
+    print(f"ltljax: {line}", file=sys.stderr)
     return code
 
 
@@ -181,11 +191,13 @@ def _run(options: argparse.Namespace) -> int:
     else:
         example, mesh = _from_file(options)
         record = dict(scenario=options.scenario, mesh=mesh, changes=options.changes)
+    inputs = [Path(name) for name in (options.scenario, options.mesh) if name is not None and Path(name).is_file()]
+    degree = options.degree or example.settings.degree
     dtype = options.dtype or example.settings.dtype
     jax.config.update("jax_enable_x64", dtype == "float64")
     run(
-        example, record, scheme=_scheme(options.scheme or example.settings.scheme, options.degree), dtype=dtype,
-        frames=options.frames or example.frames, out=options.out, resume=options.resume,
+        example, record, scheme=_scheme(options.scheme or example.settings.scheme, degree), dtype=dtype,
+        frames=options.frames or example.frames, out=options.out, inputs=inputs, resume=options.resume,
     )  # fmt: skip
     return 0
 
@@ -197,9 +209,14 @@ def _fit(options: argparse.Namespace) -> int:
         raise ValueError(f"Expected a scenario file that ends in .toml, found {options.scenario!r}.")
     changes = dict(scenario.parse_change(change) for change in options.changes)
     mesh_file = None if options.mesh is None else Path(options.mesh)
-    example = scenario.read(path.read_text(encoding="utf-8"), options.scenario, path.parent, changes, mesh_file)
+    example = scenario.read(scenario.read_text(path), options.scenario, path.parent, changes, mesh_file)
     jax.config.update("jax_enable_x64", example.settings.dtype == "float64")
-    recover(example, scheme=_scheme(example.settings.scheme, None), out=options.out, resume=options.resume)
+    recover(
+        example,
+        scheme=_scheme(example.settings.scheme, example.settings.degree),
+        out=options.out,
+        resume=options.resume,
+    )
     return 0
 
 
@@ -212,7 +229,7 @@ def _from_file(options: argparse.Namespace) -> tuple[scenario.Scenario, str]:
     if options.scenario in texts:
         text, folder = texts[options.scenario], Path()
     elif path.suffix == ".toml":
-        text, folder = path.read_text(encoding="utf-8"), path.parent
+        text, folder = scenario.read_text(path), path.parent
     else:
         names = (*scenario.SCENARIOS, *texts)
         near = difflib.get_close_matches(options.scenario, names, n=1)
@@ -221,13 +238,11 @@ def _from_file(options: argparse.Namespace) -> tuple[scenario.Scenario, str]:
             f"{f' (did you mean {near[0]}?)' if near else ''}. Names: {', '.join(names)}."
         )
     given = {"time.end": options.t1, "time.frames": options.frames, "seed": options.seed}
-    given |= {"solver.dtype": options.dtype, "solver.scheme": options.scheme}
+    given |= {"solver.dtype": options.dtype, "solver.scheme": options.scheme, "solver.degree": options.degree}
     given |= {"mesh.repair": options.repair or None, "mesh.scale": "keep" if options.keep_scale else None}
-    changes = {key: value for key, value in given.items() if value is not None}
+    # The mesh first, so that what else is said of it still holds.
+    changes: dict[str, Any] = {"mesh": {"shape": options.mesh}} if options.mesh in scenario.BUILT_IN else {}
+    changes |= {key: value for key, value in given.items() if value is not None}
     changes |= dict(scenario.parse_change(change) for change in options.changes)
-    mesh_file = None
-    if options.mesh in scenario.BUILT_IN:
-        changes["mesh"] = {"shape": options.mesh}
-    elif options.mesh is not None:
-        mesh_file = Path(options.mesh)
+    mesh_file = None if options.mesh is None or options.mesh in scenario.BUILT_IN else Path(options.mesh)
     return scenario.read(text, options.scenario, folder, changes, mesh_file), options.mesh or "its own mesh"

@@ -99,7 +99,7 @@ class Formula:
     steps: tuple[Any, ...]
     names: tuple[str, ...]
 
-    def __call__(self, **values: Array | float) -> Array:
+    def __call__(self, /, **values: Array | float) -> Array:
         """The value, for a number or an array of each name; arrays are combined as NumPy does."""
         kept: list[Array] = []
         for step in self.steps:
@@ -175,9 +175,8 @@ class _Reader:
 
     def error(self, expected: str) -> FormulaError:
         """The mistake at the token that was read last."""
-        found = "the end" if self.kind == "end" else repr(self.word)
-        shown = self.text if len(self.text) <= 80 else self.text[:77] + "..."
-        return FormulaError(f'"{shown}", column {self.start + 1}: expected {expected}, found {found}.')
+        found = "the end" if self.kind == "end" else repr(cut(self.word, 40))
+        return FormulaError(f'"{cut(self.text, 80)}", column {self.start + 1}: expected {expected}, found {found}.')
 
     def expression(self, weakest: int, depth: int) -> None:
         """Read operators that bind more strongly than the weakest, and what they join."""
@@ -235,7 +234,7 @@ class _Reader:
             self.steps.append(_CONSTANTS[word])
         else:
             allowed = (*self.known, *_CONSTANTS)
-            raise self.error(f"one of {', '.join(allowed)}{_near(word, (*allowed, *_FUNCTIONS))}")
+            raise self.error(f"one of {cut(', '.join(allowed), 400)}{_near(word, (*allowed, *_FUNCTIONS))}")
         self.next()
 
     def call(self, word: str, depth: int) -> None:
@@ -255,6 +254,11 @@ class _Reader:
         self.next()
 
 
+def cut(text: str, most: int) -> str:
+    """A text as messages show it: its beginning, where it is long."""
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def _near(word: str, allowed: Iterable[str]) -> str:
     near = difflib.get_close_matches(word[:100], list(allowed), n=1)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return f" (did you mean {cut(near[0], 40)}?)" if near else ""

@@ -3,14 +3,14 @@
 What enters: a `Scenario` and how to run it. What leaves: a folder with pictures, data and ``summary.json``.
 """
 
+import copy
 import dataclasses
 import itertools
 import json
 import platform
-import shutil
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ def run(
     dtype: str,
     frames: int,
     out: Path,
+    inputs: Iterable[Path] = (),
     resume: bool = False,
 ) -> dict[str, Any]:
     """Solve a scenario and write its results.
@@ -66,6 +67,7 @@ def run(
         dtype: ``"float32"`` or ``"float64"``.
         frames: how many states to keep, evenly spaced in time, besides the first.
         out: the folder to write to; made if absent.
+        inputs: files that the run is made from, besides those the scenario names.
         resume: whether to go on from what ``out/restart`` holds of the same run.
 
     Returns:
@@ -74,7 +76,11 @@ def run(
     Raises:
         SolveError: the run could not be carried to its end. What it had reached is written all the same.
         RestartError: ``out/restart`` holds the states of another run, or they are damaged.
+        OutputError: results would replace what the run reads, or what no run has written.
     """
+    from .output import folder
+
+    folder.check_folder(out, example.name, (*inputs, *example.files.values()), example.files)
     out.mkdir(parents=True, exist_ok=True)
     mesh = example.mesh
     start = time.perf_counter()
@@ -105,7 +111,7 @@ def run(
 
     files = _write(example, np.asarray(surface.normals), out, reached)
     if example.resolved is not None:
-        files += _keep_scenario(example, out)
+        files += _keep_scenario(example.resolved, folder.keep_inputs(out, example.files), out)
     summary = dict(
         scenario=example.name,
         options=options,
@@ -223,58 +229,93 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     # What was computed in an order that keeps neighbours together is written in that of the source.
     order = example.mesh.source_order
     vertices, faces = example.mesh.vertices[order], np.argsort(order)[example.mesh.faces].astype(np.int32)
-    name, times = example.name, np.array(reached.times)
-    fields = [dict(zip(example.species, u[order].reshape(len(u), -1).T, strict=True)) for u in reached.states]
-    shown = example.species[example.shown]
+    name, times, settings = example.name, np.array(reached.times), example.settings
+    states = [u.reshape(len(u), -1) for u in reached.states]
     series = out / "series"
     series.mkdir(exist_ok=True)
     for stale in series.glob(f"{name}_*.vtp"):
         stale.unlink()
     frames = [f"series/{name}_{index:04d}.vtp" for index in range(len(times))]
-    for frame, state in zip(frames, fields, strict=True):
-        files.write_vtp(out / frame, vertices, faces, state)
+    for frame, state in zip(frames, states, strict=True):
+        files.write_vtp(out / frame, vertices, faces, dict(zip(example.species, state[order].T, strict=True)))
     files.write_series(out / f"{name}.pvd", times, frames)
 
-    limits = _limits([state[shown] for state in fields])
-    colormap = example.settings.colormap
-    shades = colors.vertex_colors(fields[-1][shown], limits, colormap)
+    shown, last = example.species[example.shown], states[-1][order, example.shown]
+    limits, colormap = _limits(state[:, example.shown] for state in reversed(states)), settings.colormap
+    shades = colors.vertex_colors(last, limits, colormap)
     files.write_ply(out / f"{name}.ply", vertices, faces, shades)
     files.write_glb(out / f"{name}.glb", vertices, faces, shades, normals[order])
-    whole = {species: np.stack([state[species] for state in fields]) for species in (shown, *example.species)}
-    viewer.write_viewer(out / f"{name}.html", vertices, faces, times, whole, example.title or name, colormap)
     written = [f"{name}.html", f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply", f"{name}.glb"]
+    if settings.displacement:
+        moved = texture.displaced(vertices, normals[order], last, settings.displacement)
+        files.write_glb(out / f"{name}-displaced.glb", moved, faces, shades)
+        written.append(f"{name}-displaced.glb")
+    columns = {s: column for column, s in enumerate(example.species)}
+    whole = _Series(states, order, {shown: columns[shown]} | columns)
+    viewer.write_viewer(out / f"{name}.html", vertices, faces, times, whole, example.title or name, colormap)
     if not pictures.can_draw():
         print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
         return written
     if example.mesh.uv is not None:
-        folder = out / "textured"
-        folder.mkdir(exist_ok=True)
-        baked = texture.bake(example.mesh.uv, faces, fields[-1][shown])
-        image = colors.vertex_colors(baked.ravel(), limits, colormap)[:, :3].reshape(*baked.shape, 3)
-        texture.write_textured_obj(folder / f"{name}.obj", vertices, faces, example.mesh.uv, image)
-        written.append(f"textured/{name}.obj")
+        try:
+            baked = texture.bake(example.mesh.uv, faces, last)
+        except ValueError as error:
+            print(f"note: no texture is written. {error}")
+        else:
+            (out / "textured").mkdir(exist_ok=True)
+            image = colors.vertex_colors(baked.ravel(), limits, colormap)[:, :3].reshape(*baked.shape, 3)
+            texture.write_textured_obj(out / "textured" / f"{name}.obj", vertices, faces, example.mesh.uv, image)
+            written.append(f"textured/{name}.obj")
     picture = pictures.Picture(vertices, faces, shown, limits, colormap)
     captions = [f"{name}   t = {t:.3g}" for t in times]
-    images = [picture.draw(state[shown], text) for state, text in zip(fields, captions, strict=True)]
-    picture.close()
-    pictures.write_png(out / f"{name}.png", images[-1])
+    images = (picture.draw(u[order, example.shown], text) for u, text in zip(states, captions, strict=True))
     animation = pictures.write_animation(out / f"{name}.mp4", images)
+    pictures.write_png(out / f"{name}.png", picture.draw(last, captions[-1]))
+    picture.close()
     return [*written, f"{name}.png", animation.name]
 
 
-def _keep_scenario(example: Scenario, out: Path) -> list[str]:
-    """The scenario with every value, beside the files it names: run it again, and the same comes out."""
-    for file in example.files:
-        if not (out / file.name).exists() or not file.samefile(out / file.name):
-            shutil.copyfile(file, out / file.name)
-    text = tomli_w.dumps({key: value for key, value in (example.resolved or {}).items() if value not in ({}, [])})
-    (out / "scenario.toml").write_text(f"# Every value of this run: ltljax run scenario.toml\n{text}", encoding="utf-8")
-    return ["scenario.toml"]
+@dataclasses.dataclass(frozen=True)
+class _Series(Mapping[str, np.ndarray]):
+    """The species over all times, (T, V) in the order of the source, each put together when it is asked for.
+
+    Attributes:
+        states: (V, S) of each time.
+        order: (V,) of the source.
+        columns: of the species by name.
+    """
+
+    states: list[np.ndarray]
+    order: np.ndarray
+    columns: dict[str, int]
+
+    def __getitem__(self, species: str) -> np.ndarray:
+        return np.stack([state[self.order, self.columns[species]] for state in self.states])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+
+def _keep_scenario(resolved: dict[str, Any], copies: dict[str, str], out: Path) -> list[str]:
+    """The scenario with every value, naming the copies of its files: run it again, and the same comes out."""
+    tables = copy.deepcopy({key: value for key, value in resolved.items() if value not in ({}, [])})
+    for key, file in copies.items():
+        *path, last = key.split(".")
+        inner: Any = tables
+        for part in path:
+            inner = inner[int(part)] if isinstance(inner, list) else inner[part]
+        inner[last] = file
+    text = f"# Every value of this run: ltljax run scenario.toml\n{tomli_w.dumps(tables)}"
+    (out / "scenario.toml").write_text(text, encoding="utf-8")
+    return ["scenario.toml", *copies.values()]
 
 
 def _limits(states: Iterable[np.ndarray]) -> tuple[float, float]:
-    """The range of the last state that is finite, a little of it even where that is uniform."""
-    last = [values for values in states if np.isfinite(values).all()][-1]
+    """The range of the first of the states that is finite, a little of it even where that is uniform."""
+    last = next(values for values in states if np.isfinite(values).all())
     low, high = float(last.min()), float(last.max())
     margin = 1e-3 * max(abs(low), abs(high), 1e-12)
     return (low, high) if high - low > margin else (low - margin, high + margin)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .mesh import Mesh
 from .solve import Dispersion, Solution
 from .surface import Surface
 from .tables import AnyArray
@@ -85,6 +86,27 @@ def view(
     fields = {name: states[:, :, s] for s, name in enumerate(names)}
     page = viewer_html(np.asarray(surface.vertices), np.asarray(surface.faces), times, fields, title, colormap)
     return Inline(page, height)
+
+
+def displaced(surface: Surface, u: Float[AnyArray, " V"], amount: float = 0.1) -> Mesh:
+    """The surface with a field as its relief, to be printed or rendered: a mesh (host).
+
+    Args:
+        surface: the surface.
+        u: (V,). Vertices move along the normals, by nothing where it is least and by ``amount`` where it is largest.
+        amount: a length; a negative one moves inwards.
+
+    Raises:
+        ValueError: the field does not fit the surface, or is not finite.
+        MeshError: the relief is so high that faces fall together.
+    """
+    from .output import texture
+
+    values = _fitting(surface, u)
+    if not np.isfinite(values).all():
+        raise ValueError(f"Expected finite values, found {values[~np.isfinite(values)][0]}.")
+    vertices, normals = (np.asarray(array, np.float64) for array in (surface.vertices, surface.normals))
+    return Mesh(texture.displaced(vertices, normals, values, amount), np.asarray(surface.faces))
 
 
 def plot_dispersion(dispersion: Dispersion, eigenvalues: AnyArray | None = None, axes: Any = None) -> Any:

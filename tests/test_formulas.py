@@ -134,3 +134,8 @@ def test_no_text_does_more_than_parse_or_say_why_not(text):
     except FormulaError:
         return
     jnp.asarray(formula(**dict.fromkeys(formula.names, 1.0)))
+
+
+def test_a_name_may_be_that_of_python():
+    found = parse("self + values", ("self", "values"))
+    assert float(found(**{"self": 1.0, "values": 2.0})) == 3

@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "solve": {"equations", "operators", "surface", "tables", "lifting", "mesh"},
     "fit": {"equations", "operators", "surface", "tables", "solve", "progress", "output"},
     "output": set(),
-    "show": {"surface", "solve", "tables", "output"},
+    "show": {"mesh", "surface", "solve", "tables", "output"},
     "scenario": {"formulas", "mesh", "lifting", "elliptic", "equations", "operators", "surface", "solve", "output"},
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
     "recover": {"scenario", "fit", "lifting", "surface"},

@@ -103,6 +103,45 @@ def test_without_a_map_or_with_wrong_shapes_baking_says_so():
         texture.bake(sheet.uv[1:], sheet.faces, np.zeros(sheet.num_vertices))
 
 
+def test_a_map_that_is_tiled_or_not_finite_is_refused():
+    sheet = square_with_map(4)
+    values = np.zeros(sheet.num_vertices)
+    with pytest.raises(ValueError, match="found others in face 0"):
+        texture.bake(np.full_like(sheet.uv, np.inf), sheet.faces, values)
+    with pytest.raises(ValueError, match="The map is tiled"):
+        texture.bake(1e6 * sheet.uv, sheet.faces, values)
+    with pytest.raises(ValueError, match="16 images in all"):
+        texture.bake(4 * sheet.uv, sheet.faces, values)
+
+
+def test_a_map_far_outside_is_repeated():
+    sheet = square_with_map(4)
+    values = sheet.vertices[:, 0]
+    np.testing.assert_allclose(
+        texture.bake(sheet.uv + 1000, sheet.faces, values, 64),
+        texture.bake(sheet.uv, sheet.faces, values, 64),
+        atol=1e-9,
+    )
+
+
+def test_letters_beyond_ascii_do_not_reach_the_names_inside_an_obj(tmp_path):
+    pytest.importorskip("imageio")
+    sheet = square_with_map(2)
+    image = np.zeros((4, 4, 3), np.uint8)
+    texture.write_textured_obj(tmp_path / "塗.obj", sheet.vertices, sheet.faces, sheet.uv, image)
+    opened = trimesh.load(tmp_path / "塗.obj", force="mesh")
+    assert opened.visual.material.image.size == (4, 4)
+
+
+def test_a_surface_takes_a_field_as_its_relief():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+    z = np.asarray(surface.vertices[:, 2])
+    raised = ltl.displaced(surface, z, 0.5)
+    np.testing.assert_allclose(np.linalg.norm(raised.vertices, axis=1).max(), 1.5, atol=1e-3)
+    with pytest.raises(ValueError, match="finite values"):
+        ltl.displaced(surface, np.full_like(z, np.nan))
+
+
 def test_displacement_follows_the_normals():
     mesh = ltl.shapes.icosphere(2)
     moved = texture.displaced(mesh.vertices, mesh.vertices, mesh.vertices[:, 2], 0.5)

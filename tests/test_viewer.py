@@ -62,7 +62,7 @@ def test_a_uniform_state_and_one_time_are_enough(sphere):
 
 def test_a_title_cannot_end_the_script_it_stands_in(sphere):
     times, fields = states(sphere)
-    title = "</script><script>alert(1)</script>"
+    title = "</script><script>alert(1)</script> @bundle@ @data@"
     page = viewer_html(sphere.vertices, sphere.faces, times, fields, title)
     assert title not in page
     assert json.loads(part(page, "header"))["title"] == title
@@ -85,14 +85,25 @@ def test_it_shows_inside_a_notebook(sphere):
     assert '"viridis"' not in shown.split("srcdoc=")[1].split("style")[0].replace("&quot;", "")
 
 
-def test_a_long_run_on_a_fine_mesh_stays_small():
+def moving(mesh, count):
+    """Waves that grow and move, with noise of its own in each frame, over 100 frames."""
+    x, y, z = mesh.vertices.T
+    rng = np.random.default_rng(0)
+    fields = {}
+    for k in range(count):
+        wave = [np.sin(20 * x + (k + 1) * t / 9) * np.cos(17 * y - k * z) * np.tanh(t / 30) for t in range(100)]
+        fields[f"u{k}"] = np.stack(wave) + 1e-4 * rng.normal(size=(100, mesh.num_vertices))
+    return fields
+
+
+@pytest.mark.parametrize(("count", "off"), [(2, 1e-3), (5, 2.1e-3)])
+def test_a_long_run_on_a_fine_mesh_stays_small(count, off):
     mesh = ltl.shapes.icosphere(6)
-    x, y, _ = mesh.vertices.T
-    # Waves that grow and move, with the noise of a real run in their last digits.
-    noise = np.random.default_rng(0).normal(size=mesh.num_vertices)
-    u = np.stack([np.sin(20 * x + k / 9) * np.cos(17 * y) * np.tanh(k / 30) + 1e-4 * noise for k in range(100)])
-    page = viewer_html(mesh.vertices, mesh.faces, np.arange(100.0), {"u": u})
+    fields = moving(mesh, count)
+    page = viewer_html(mesh.vertices, mesh.faces, np.arange(100.0), fields)
     assert len(page) < 15e6
+    for index, values in enumerate(fields.values()):
+        assert np.abs(unpacked(page, index) - values).max() < off * np.ptp(values)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +161,18 @@ def test_a_browser_shows_plays_and_answers(browser, sphere, tmp_path, size):
     assert page.locator("#value").inner_text().startswith("v = ")
     assert page.evaluate("viewer.valueAt(3, 90)") is None
 
-    # Turning, playing, keys, and a picture to save.
+    # Nothing is asked again while nothing moves.
+    page.wait_for_timeout(300)
+    answers = page.evaluate("viewer.answers")
+    page.wait_for_timeout(500)
+    assert page.evaluate("viewer.answers") == answers > 0
+
+    # Coming closer, turning, playing, keys, and a picture to save.
+    far = page.evaluate("viewer.distance")
+    page.mouse.wheel(0, -400)
+    page.wait_for_function("far => viewer.distance < 0.95 * far", arg=far)
+    page.mouse.wheel(0, 400)
+    page.wait_for_timeout(800)
     page.mouse.down()
     page.mouse.move(middle[0] + 90, middle[1] + 30)
     page.mouse.up()
@@ -166,3 +188,43 @@ def test_a_browser_shows_plays_and_answers(browser, sphere, tmp_path, size):
     assert saved.value.suggested_filename == "Waves-on-a-sphere.png"
     assert said == []
     page.close()
+
+
+def test_fingers_turn_it_pinch_it_and_read_values(browser, sphere, tmp_path):
+    times, fields = states(sphere)
+    path = tmp_path / "run.html"
+    write_viewer(path, sphere.vertices, sphere.faces, times, fields, "Waves")
+    context = browser.new_context(viewport=dict(width=390, height=844), has_touch=True, is_mobile=True)
+    page = context.new_page()
+    said = []
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(path.as_uri())
+    page.wait_for_function("window.viewerReady === true", timeout=60_000)
+    box = page.locator("#scene").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.touchscreen.tap(x, y)
+    page.wait_for_function("!document.getElementById('value').hidden")
+    assert page.locator("#value").inner_text().startswith("u = ")
+
+    fingers = context.new_cdp_session(page)
+
+    def touch(kind, *places):
+        points = [dict(x=a, y=b, id=index) for index, (a, b) in enumerate(places)]
+        fingers.send("Input.dispatchTouchEvent", dict(type=kind, touchPoints=points))
+        page.wait_for_timeout(50)
+
+    before = page.locator("#scene").screenshot()
+    touch("touchStart", (x, y))
+    for k in range(1, 6):
+        touch("touchMove", (x + 15 * k, y))
+    touch("touchEnd")
+    page.wait_for_timeout(800)
+    assert page.locator("#scene").screenshot() != before
+    far = page.evaluate("viewer.distance")
+    touch("touchStart", (x - 30, y), (x + 30, y))
+    for k in range(1, 6):
+        touch("touchMove", (x - 30 - 15 * k, y), (x + 30 + 15 * k, y))
+    touch("touchEnd")
+    page.wait_for_function("far => viewer.distance < 0.8 * far", arg=far)
+    assert said == []
+    context.close()

@@ -85,7 +85,7 @@ def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[
     offsets = 3 * np.arange(1, len(faces) + 1)
     point_data = "".join(_array(name, np.asarray(values)) for name, values in fields.items())
     path.write_text(
-        '<?xml version="1.0"?>\n'
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
         'compressor="vtkZLibDataCompressor">\n'
         f'<PolyData><Piece NumberOfPoints="{len(vertices)}" NumberOfPolys="{len(faces)}" NumberOfVerts="0" '
@@ -94,7 +94,7 @@ def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[
         f"<Points>\n{_array('Points', vertices)}</Points>\n"
         f"<Polys>\n{_array('connectivity', faces.ravel().astype(np.int64))}{_array('offsets', offsets)}</Polys>\n"
         "</Piece></PolyData>\n</VTKFile>\n",
-        encoding="ascii",
+        encoding="utf-8",
     )
 
 
@@ -104,9 +104,9 @@ def write_series(path: Path, times: np.ndarray, files: list[str]) -> None:
         f'<DataSet timestep="{time:.17g}" file={quoteattr(file)}/>\n' for time, file in zip(times, files, strict=True)
     )
     path.write_text(
-        '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n'
+        '<?xml version="1.0" encoding="UTF-8"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n'
         f"<Collection>\n{entries}</Collection>\n</VTKFile>\n",
-        encoding="ascii",
+        encoding="utf-8",
     )
 
 

@@ -97,18 +97,29 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def write_animation(path: Path, images: Iterable[np.ndarray]) -> Path:
-    """Write pictures as an MP4, or as a GIF beside it where no encoder is installed; returns the file written."""
+    """Write pictures, one at least, as an MP4, or as a GIF where no encoder is installed; returns the file written."""
     import imageio.v2
 
-    write: Any = imageio.v2.mimwrite
-    frames = list(images)
+    frames = iter(images)
+    first = next(frames)
+    kinds: list[tuple[Path, dict[str, Any]]] = [
+        (path, dict(fps=_FRAMES_PER_SECOND, quality=8)),
+        (path.with_suffix(".gif"), dict(duration=1000 / _FRAMES_PER_SECOND, loop=0)),
+    ]
     with warnings.catch_warnings():
         # The encoder is a program of its own, started by fork and exec; JAX warns of forks that go on in Python.
         warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
-        try:
-            write(path, frames, fps=_FRAMES_PER_SECOND, quality=8)
-        except (ValueError, ImportError, OSError, RuntimeError):
-            path = path.with_suffix(".gif")
-            seconds = 1000 / _FRAMES_PER_SECOND
-            write(path, frames, duration=seconds, loop=0)
-    return path
+        for file, how in kinds:
+            try:
+                writer: Any = imageio.v2.get_writer(file, **how)
+                writer.append_data(first)
+            except (ValueError, ImportError, OSError, RuntimeError):
+                if file == kinds[-1][0]:
+                    raise
+                continue
+            # Each is drawn when the last is written: none is held.
+            with writer:
+                for image in frames:
+                    writer.append_data(image)
+            return file
+    raise AssertionError  # the last kind returns or raises

@@ -9,6 +9,8 @@ import numpy as np
 
 # Triangles are painted in groups whose boxes have at most this many pixels together.
 _PIXELS = 4_000_000
+# A map whose faces have more pixels than this many images is tiled: each pixel would stand for many places.
+_OVERLAPS = 8
 # By how many pixels every chart is widened, so that no seam shows where an image is drawn smaller.
 _MARGIN = 4
 
@@ -25,7 +27,7 @@ def bake(uv: np.ndarray | None, faces: np.ndarray, values: np.ndarray, size: int
         size: of the image in pixels.
 
     Raises:
-        ValueError: there is no UV map, or shapes do not fit.
+        ValueError: there is no UV map, it is tiled or not finite, or shapes do not fit.
     """
     if uv is None:
         raise ValueError(
@@ -36,6 +38,18 @@ def bake(uv: np.ndarray | None, faces: np.ndarray, values: np.ndarray, size: int
     if values.ndim not in (1, 2) or faces.max() >= len(values):
         raise ValueError(f"Expected values of shape ({faces.max() + 1},) or more, found {values.shape}.")
     columns = values.reshape(len(values), -1).astype(np.float64)
+    if not np.isfinite(uv).all():
+        face = int(np.argmin(np.isfinite(uv).all(axis=(1, 2))))
+        raise ValueError(f"Expected a UV map of finite numbers, found others in face {face}. Unwrap the mesh anew.")
+    extents = np.ptp(uv, axis=1)
+    if (extents > 1).any() or 0.5 * extents.prod(axis=1).sum() > _OVERLAPS:
+        raise ValueError(
+            f"Expected a UV map that covers the image at most {_OVERLAPS} times, with faces no larger than it; found "
+            f"faces as large as {extents.max():.3g} images, {0.5 * extents.prod(axis=1).sum():.3g} images in all. The "
+            "map is tiled: unwrap the mesh anew, without repetition."
+        )
+    # What lies far outside is repeated, so whole turns may be left out.
+    uv = uv - np.floor(uv.min(axis=1, keepdims=True))
     # Pixel centres lie at whole numbers.
     corners = uv * [size, -size] + [-0.5, size - 0.5]
     low = np.ceil(corners.min(axis=1)).astype(int)
@@ -70,13 +84,15 @@ def write_textured_obj(
 
     places, index = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
     corners = np.stack([faces + 1, index.reshape(faces.shape) + 1], axis=2)
-    lines = [f"mtllib {path.stem}.mtl", "usemtl surface"]
+    # Readers of OBJ files disagree about letters beyond ASCII in names: those of these two files have none.
+    stem = path.stem if path.stem.isascii() else "surface"
+    material, picture = path.with_name(f"{stem}.mtl"), path.with_name(f"{stem}.png")
+    lines = [f"mtllib {material.name}", "usemtl surface"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
     lines += [f"vt {u:.9g} {v:.9g}" for u, v in places.tolist()]
     lines += ["f " + " ".join(f"{vertex}/{place}" for vertex, place in face) for face in corners.tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-    material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
-    material.write_text(f"newmtl surface\nKd 1 1 1\nKs 0 0 0\nmap_Kd {picture.name}\n", encoding="utf-8")
+    material.write_text(f"newmtl surface\nKd 1 1 1\nKs 0 0 0\nmap_Kd {picture.name}\n", encoding="ascii")
     write_png(picture, image)
     return [path, material, picture]
 

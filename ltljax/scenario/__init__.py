@@ -1,7 +1,7 @@
 """What a person wants to run: a name, options or a file become a `Scenario`, ready to be solved."""
 
 from .paper import BUILT_IN, SCENARIOS, SOURCES
-from .reader import ScenarioError
+from .reader import ScenarioError, read_text
 from .scenario import Options, Scenario, Settings
 from .written import SCHEMES, library, parse_change, read, title
 
@@ -17,5 +17,6 @@ __all__ = [
     "library",
     "parse_change",
     "read",
+    "read_text",
     "title",
 ]

@@ -2,20 +2,47 @@
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
-from ..formulas import Formula, FormulaError, parse
+from ..formulas import Formula, FormulaError, cut, parse
 
 # More than any scenario needs; what is larger is not one.
 _LARGEST_FILE = 1_000_000
 _DEEPEST = 8
+# A key of many parts takes the parser time in proportion to the square of their number, whose depth is seen only after.
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{4 * _DEEPEST}}}")
+# Longer names and lists of names are not spelled out in messages.
+_LONGEST_NAME, _LONGEST_LIST = 40, 400
 
 
 class ScenarioError(ValueError):
     """A scenario file that does not say what to do."""
+
+
+def read_text(path: Path) -> str:
+    """The text of a scenario file.
+
+    Raises:
+        ScenarioError: it is no regular file, too long, or not in UTF-8.
+        OSError: it cannot be read.
+    """
+    if path.exists() and not path.is_file():
+        raise ScenarioError(f"{path}: expected a file, found a folder or a device.")
+    with open(path, "rb") as file:
+        data = file.read(4 * _LARGEST_FILE + 1)
+    if len(data) > 4 * _LARGEST_FILE:
+        raise ScenarioError(f"{path}: expected at most {_LARGEST_FILE} characters, found more.")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        found = f"the byte 0x{data[error.start]:02x} in line {line}"
+        raise ScenarioError(f"{path}: expected text in UTF-8, found {found}. Save it as UTF-8.") from None
 
 
 def load(text: str, name: str) -> dict[str, Any]:
@@ -26,6 +53,9 @@ def load(text: str, name: str) -> dict[str, Any]:
     """
     if len(text) > _LARGEST_FILE:
         raise ScenarioError(f"{name}: expected at most {_LARGEST_FILE} characters, found {len(text)}.")
+    if found := _LONG_KEY.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ScenarioError(f"{name}: expected keys of at most {_DEEPEST} parts, found more in line {line}.")
     try:
         tables = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
@@ -67,12 +97,16 @@ class Table:
     def error(self, key: str, expected: str) -> ScenarioError:
         """The mistake that the value of a key is."""
         return ScenarioError(
-            f"{self._file}: expected {expected} as {self._name(key)}, found {_shown(self._values.get(key))}."
+            f"{self._file}: expected {expected} as {self.name(key)}, found {_shown(self._values.get(key))}."
         )
+
+    def refused(self, key: str, reason: object) -> ScenarioError:
+        """The mistake that the value of a key is, as another room has put it."""
+        return ScenarioError(f"{self._file}: {self.name(key)}: {reason}")
 
     def table(self, key: str) -> "Table":
         """A table inside; empty where there is none."""
-        inner = Table(self._values.get(key, {}), self._file, self._name(key))
+        inner = Table(self._values.get(key, {}), self._file, self.name(key))
         self.taken[key] = inner.taken
         return inner
 
@@ -80,8 +114,8 @@ class Table:
         """The tables of a list of tables; none by default."""
         value = self._values.get(key, [])
         if not isinstance(value, list):
-            raise self.error(key, f"a list of tables, [[{self._name(key)}]],")
-        inner = [Table(entry, self._file, self._name(key)) for entry in value]
+            raise self.error(key, f"a list of tables, [[{self.name(key)}]],")
+        inner = [Table(entry, self._file, self.name(key)) for entry in value]
         self.taken[key] = [one.taken for one in inner]
         return inner
 
@@ -123,7 +157,7 @@ class Table:
         """One of several words."""
         value = self._values.get(key, default)
         if not isinstance(value, str) or value not in allowed:
-            raise self.error(key, f"one of {', '.join(allowed)}{_near(value, allowed)}")
+            raise self.error(key, f"one of {listed(allowed)}{_near(value, allowed)}")
         return self._take(key, value)
 
     def formula(self, key: str, names: Iterable[str], default: float | str | None = None) -> Formula:
@@ -135,7 +169,7 @@ class Table:
         try:
             found = parse(repr(float(value)) if is_number else value, names)  # type: ignore
         except FormulaError as error:
-            raise ScenarioError(f"{self._file}: {self._name(key)}: {error}") from None
+            raise self.refused(key, error) from None
         self._take(key, value)
         return found
 
@@ -144,7 +178,7 @@ class Table:
         value = self._values.get(key)
         if not isinstance(value, list) or len(value) != count:
             raise self.error(key, f"a list of {count} formulas")
-        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self._name(key))
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
         found = [inner.formula(str(index), names) for index in range(count)]
         self._take(key, value)
         return found
@@ -154,7 +188,7 @@ class Table:
         value = self._values.get(key, list(default))
         if not isinstance(value, list) or len(value) != len(default):
             raise self.error(key, f"a list of {len(default)} numbers")
-        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self._name(key))
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
         return self._take(key, [inner.number(str(index), 0.0, least, most) for index in range(len(default))])
 
     def texts(self, key: str) -> list[str]:
@@ -188,16 +222,17 @@ class Table:
         for key in self.names():
             allowed = sorted(self.taken)
             raise ScenarioError(
-                f"{self._file}: {self._name(key)} is not known{_near(key, allowed)}. "
-                f"Known here: {', '.join(allowed) or 'nothing'}."
+                f"{self._file}: {self.name(key)} is not known{_near(key, allowed)}. Known here: {listed(allowed)}."
             )
 
     def _take(self, key: str, value: Any) -> Any:
         self.taken[key] = value
         return value
 
-    def _name(self, key: str) -> str:
-        return f"{self._path}.{key}" if self._path else key
+    def name(self, key: str) -> str:
+        """A key with those of the tables around it, as ``kinetics.feed``; cut where it is very long."""
+        short = cut(key, _LONGEST_NAME)
+        return f"{self._path}.{short}" if self._path else short
 
 
 def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -> bool:
@@ -208,11 +243,19 @@ def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -
     return math.isfinite(number) and least <= number <= most
 
 
+def listed(names: Collection[str]) -> str:
+    """Names with commas between, not all where they are many."""
+    return cut(", ".join(names), _LONGEST_LIST) or "nothing"
+
+
 def _shown(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
-    return text if len(text) < 80 else text[:77] + "..."
+    try:
+        text = "nothing" if value is None else repr(value)
+    except (ValueError, RecursionError):  # a whole number of more digits than Python writes
+        text = f"a very large {type(value).__name__}"
+    return cut(text, 80)
 
 
 def _near(value: Any, allowed: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(value)[:100], list(allowed), n=1)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return f" (did you mean {cut(near[0], 40)}?)" if near else ""

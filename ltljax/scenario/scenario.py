@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import diffrax
@@ -20,6 +21,7 @@ class Settings:
 
     Attributes:
         scheme: ``"monotone"``, ``"polynomial"`` or ``"paper"``.
+        degree: of the scheme ``"polynomial"``.
         dtype: ``"float32"`` or ``"float64"``.
         solver: as of `solve`; None for its default.
         rtol: relative tolerance.
@@ -27,9 +29,12 @@ class Settings:
         dt: the length of fixed steps; None for adaptive ones.
         show: the species that pictures show.
         colormap: the name of their colours.
+        displacement: how far the largest value of ``show`` is raised above the least in a surface written for that;
+            zero for none.
     """
 
     scheme: str = "monotone"
+    degree: int | None = None
     dtype: str = "float64"
     solver: diffrax.AbstractSolver | None = None
     rtol: float = 1e-4
@@ -37,6 +42,7 @@ class Settings:
     dt: float | None = None
     show: str = "u"
     colormap: str = "viridis"
+    displacement: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +91,7 @@ class Scenario:
         frames: how many states are kept besides the first, unless the command line says otherwise.
         settings: how it is solved and shown.
         resolved: of a scenario file, all its tables with every value, defaults too.
-        files: of a scenario file, the files it names.
+        files: of a scenario file, the files it names, by the dotted key that does.
         wanted: of a scenario file with a table ``[fit]``, what is to be found from what was seen.
     """
 
@@ -104,7 +110,7 @@ class Scenario:
     frames: int = 60
     settings: Settings = Settings()
     resolved: dict[str, Any] | None = None
-    files: tuple[Path, ...] = ()
+    files: Mapping[str, Path] = MappingProxyType({})
     wanted: Wanted | None = None
 
 

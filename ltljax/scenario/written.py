@@ -6,12 +6,16 @@ whose ``resolved`` table holds every value, defaults too.
 
 import functools
 import inspect
+import io
+import json
 import math
+import zipfile
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+from xml.parsers import expat
 
 import diffrax
 import equinox as eqx
@@ -20,15 +24,15 @@ import numpy as np
 
 from ..elliptic import direction_tensor, elliptic_stencil
 from ..equations import CahnHilliard, Diffusion, Equation, ReactionDiffusion, kinetics
-from ..formulas import Formula
-from ..mesh import Mesh, load_mesh, shapes
+from ..formulas import Formula, cut
+from ..mesh import Mesh, MeshError, load_mesh, shapes
 from ..operators import curvature
 from ..output.colors import COLORMAPS
 from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface
 from .observed import wanted
 from .paper import parse_condition
-from .reader import ScenarioError, Table, load
+from .reader import ScenarioError, Table, listed, load
 from .scenario import Scenario, Settings, scaled_to_unit_area
 
 # Where nothing else is said every formula knows these: positions, a random number for each vertex between -1 and 1, and
@@ -42,6 +46,8 @@ SOLVERS = {
     "CrankNicolson": CrankNicolson, "SBDF2": SBDF2, "KenCarp3": diffrax.KenCarp3, "KenCarp4": diffrax.KenCarp4,
     "Kvaerno5": diffrax.Kvaerno5,
 }  # fmt: skip
+# Those that take a stiff part of the rate apart from the rest.
+_SPLITTING = ("SBDF2", "KenCarp3", "KenCarp4")
 SCHEMES = ("monotone", "polynomial", "paper")
 _SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
     "sphere": (shapes.icosphere, {"subdivisions": (5, 8)}),
@@ -56,6 +62,7 @@ _SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
 _CURVED = {"greatest-curvature": True, "least-curvature": False}
 # States of more bytes than this are not kept without being asked twice.
 _MOST_BYTES = 8e9
+_MOST_SPECIES = 64
 
 
 def library() -> dict[str, str]:
@@ -78,7 +85,7 @@ def parse_change(text: str) -> tuple[str, Any]:
     """
     key, _, value = (part.strip() for part in text.partition("="))
     if not value or not all(part.isidentifier() for part in key.split(".")):
-        raise ScenarioError(f"Expected --set KEY=VALUE, such as kinetics.feed=0.05, found {text!r}.")
+        raise ScenarioError(f"Expected --set KEY=VALUE, such as kinetics.feed=0.05, found {cut(text, 80)!r}.")
     try:
         return key, load(f"value = {value}", "--set")["value"]
     except ScenarioError:
@@ -94,38 +101,41 @@ def read(
         text: TOML.
         name: of the file or scenario, for messages.
         folder: the only one whose files the text may name.
-        changes: values by dotted key that replace those of the text, as ``{"kinetics.feed": 0.05}``.
-        mesh_file: a mesh file from anywhere, in place of the text's mesh.
+        changes: values by dotted key that replace those of the text, as ``{"kinetics.feed": 0.05}``; in their order.
+        mesh_file: a mesh file from anywhere, in place of the text's mesh, before the changes.
 
     Raises:
         ScenarioError: the text has a mistake; its file, key, what was found and what is allowed are named.
     """
     tables = load(text, name)
+    if mesh_file is not None:
+        given = Table(tables.get("mesh", {}), name, "mesh")
+        kept = {key: given.peek(key) for key in ("scale", "repair") if key in given}
+        tables["mesh"] = kept | {"file": mesh_file.name}
     for key, value in (changes or {}).items():
         _set(tables, key, value, name)
-    if mesh_file is not None:
-        kept = {key: value for key, value in tables.get("mesh", {}).items() if key in ("scale", "repair")}
-        tables["mesh"] = kept | {"file": mesh_file.name}
-        folder = mesh_file.parent
     root = Table(tables, name)
-    title = root.text("title", Path(name).stem)
+    title = root.text("title", _plain(Path(name).stem))
     seed = root.count("seed", 0, 0, 2**63 - 1)
-    mesh, used, note = _mesh(root.table("mesh"), folder)
+    mesh, used, note = _mesh(root.table("mesh"), folder if mesh_file is None else mesh_file.parent)
     place = _places(root.table("bumps"), mesh, seed)
     make_equation, species, numbers = _equation(root, mesh, place)
-    start, start_file = _start(root.table("initial"), mesh, place, species, folder)
-    settings = _settings(root, species)
     time = root.table("time")
     end = time.number("end", 10.0, least=1e-300)
     frames = time.count("frames", 60, 1, 10_000)
     time.finish()
+    # Every state is kept, and to be written three more of one species.
+    if (size := 8.0 * (frames + 1) * mesh.num_vertices * (len(species) + 3)) > _MOST_BYTES:
+        raise ScenarioError(
+            f"{name}: {frames} frames (time.frames) of {mesh.num_vertices} vertices and {len(species)} species would "
+            f"take {size / 1e9:.0f} GB of memory. Expected at most 8 GB: ask for fewer frames, or a coarser mesh."
+        )
+    start, start_file = _start(root.table("initial"), mesh, place, species, folder)
+    settings = _settings(root, species)
     sought = wanted(root.table("fit"), numbers, mesh, species, end, folder)
     root.finish()
-    if (size := (frames + 1) * start.nbytes) > _MOST_BYTES:
-        raise ScenarioError(
-            f"{name}: {frames} frames of {mesh.num_vertices} vertices would take {size / 1e9:.0f} GB of memory. "
-            "Expected at most 8 GB: ask for fewer frames, or a coarser mesh."
-        )
+    named = {"mesh.file": used, "initial.file": start_file}
+    named |= {f"fit.data.{index}.file": path for index, path in enumerate(sought.files if sought else ())}
     return Scenario(
         name=_plain(Path(name).stem),
         mesh=mesh,
@@ -140,7 +150,7 @@ def read(
         frames=frames,
         settings=settings,
         resolved=root.taken,
-        files=(*(path for path in (used, start_file) if path is not None), *(sought.files if sought else ())),
+        files={key: path for key, path in named.items() if path is not None},
         wanted=sought,
     )
 
@@ -151,7 +161,7 @@ def _set(tables: dict[str, Any], key: str, value: Any, name: str) -> None:
     for part in path:
         inner = inner.setdefault(part, {})
         if not isinstance(inner, dict):
-            raise ScenarioError(f"{name}: {key} cannot be set: {part} is no table.")
+            raise ScenarioError(f"{name}: {cut(key, 80)} cannot be set: {cut(part, 40)} is no table.")
     inner[last] = value
 
 
@@ -165,7 +175,11 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
         repair = table.flag("repair", False)
         scale = table.choice("scale", ("unit", "keep"), "unit")
         table.finish()
-        mesh = load_mesh(path, repair=repair).reordered()
+        try:
+            _check_self_contained(path)
+            mesh = load_mesh(path, repair=repair).reordered()
+        except MeshError as error:
+            raise table.refused("file", error) from None
         if scale == "keep":
             return mesh, path, (f"The mesh keeps its scale: area {mesh.area:.6g}.",)
         mesh, note = scaled_to_unit_area(mesh)
@@ -185,8 +199,31 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
     return make(**arguments), None, ()
 
 
+def _check_self_contained(path: Path) -> None:
+    """Raise where a mesh file names others: it could name any, and a copy of it would lack them."""
+    named: list[Any] = []
+    try:
+        if path.suffix.lower() == ".gii":
+            parser = expat.ParserCreate()
+            parser.StartElementHandler = lambda _, values: named.append(values.get("ExternalFileName"))
+            parser.Parse(path.read_bytes(), True)
+        elif path.suffix.lower() in (".gltf", ".glb"):
+            data = path.read_bytes()
+            text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
+            named += [buffer.get("uri") for buffer in json.loads(text)["buffers"]]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, expat.ExpatError):
+        pass  # damaged: reading it says how
+    for other in named:
+        if other and not str(other).startswith("data:"):
+            raise MeshError(
+                f"{path.name}: expected a file that holds all of its data, found one that refers to "
+                f"{str(other)[:60]!r}. Export it in one file, such as GLB, OBJ or PLY."
+            )
+
+
 def _places(table: Table, mesh: Mesh, seed: int) -> Callable[[Formula, str], np.ndarray]:
-    """What evaluates a formula at every vertex; random numbers differ from key to key, and not with the order."""
+    """What evaluates a formula at every vertex; random numbers differ from one dotted key to another, and
+    not with the order of either."""
     count = table.count("count", 12, 1, 10_000)
     radius = table.number("radius", 0.1, 1e-6, 1e6)
     table.finish()
@@ -258,6 +295,8 @@ def _written_reaction(table: Table, parameters: Table, place) -> tuple[_Reaction
         if not (key.startswith("d") and key[1:].isidentifier()):
             raise table.error(key, "the rate of a species, such as du or dv,")
     species = tuple(key[1:] for key in rates)
+    if len(species) > _MOST_SPECIES:
+        raise table.error(rates[-1], f"at most {_MOST_SPECIES} species; without this one")
     for name in names:
         if name in species or not name.isidentifier():
             raise parameters.error(name, "a name that is no species'")
@@ -301,7 +340,10 @@ def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[..., Equation], 
     diffusion.finish()
     direction, flow = _direction(root.table("direction"), place, species), _flow(root.table("flow"), place)
     boundary = root.table("boundary")
-    conditions = tuple(parse_condition(text) for text in boundary.texts("conditions")) if boundary.names() else ()
+    try:
+        conditions = tuple(parse_condition(text) for text in boundary.texts("conditions"))
+    except ValueError as error:
+        raise boundary.refused("conditions", error) from None
     boundary.finish()
     loops = [condition.where if isinstance(condition.where, int) else 0 for condition in conditions]
     if any(loop >= len(mesh.boundary_loops) for loop in loops):
@@ -331,7 +373,7 @@ def _field(table: Table, key: str, place, default: Any = None) -> np.ndarray | f
         if not math.isfinite(value):
             raise table.error(key, "a finite number")
         return value
-    return _finite(place(formula, key), table, key)
+    return _finite(place(formula, table.name(key)), table, key)
 
 
 def _direction(
@@ -381,7 +423,8 @@ def _flow(table: Table, place) -> np.ndarray | None:
 def _vectors(table: Table, key: str, place) -> np.ndarray:
     """The vectors (V, 3) of three formulas."""
     parts = [
-        place(formula, f"{key}.{axis}") for formula, axis in zip(table.formulas(key, 3, PLACES), "xyz", strict=True)
+        place(formula, f"{table.name(key)}.{axis}")
+        for formula, axis in zip(table.formulas(key, 3, PLACES), "xyz", strict=True)
     ]
     return _finite(np.stack(parts, axis=-1), table, key)
 
@@ -410,26 +453,54 @@ def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Pa
     path = table.file("file", folder)
     table.finish()
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            columns = [np.asarray(arrays[s], np.float64) for s in species]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise table.error("file", f"an .npz file with arrays {', '.join(species)} ({error})") from None
+        columns = _arrays(path, species, mesh.num_vertices)
+    except Exception as error:  # damaged archives raise anything; here all mean the same
+        reason = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
+        raise table.error("file", f"an .npz file with arrays {listed(species)} ({reason})") from None
     state = np.empty((mesh.num_vertices, len(species)))
     for s, column in zip(species, columns, strict=True):
-        if column.shape != (mesh.num_vertices,) or not np.isfinite(column).all():
-            raise table.error("file", f"finite values of shape ({mesh.num_vertices},) for {s}")
+        if not np.isfinite(column).all():
+            raise table.error("file", f"finite values for {s}")
     state[mesh.source_order] = np.stack(columns, axis=1)
     return state, path
+
+
+def _arrays(path: Path, names: tuple[str, ...], size: int) -> list[np.ndarray]:
+    """The arrays (V,) of an .npz file, which is told by its head what it holds before that is unpacked.
+
+    Source: numpy.lib.format.
+    """
+    columns = []
+    # Of sixteen bytes an entry at most, and a head.
+    longest = 16 * size + 4096
+    with zipfile.ZipFile(path) as archive:
+        for name in names:
+            with archive.open(f"{name}.npy") as file:
+                data = io.BytesIO(file.read(longest))
+            version = np.lib.format.read_magic(data)
+            read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, _, dtype = read[version](data)
+            if shape != (size,) or dtype.kind not in "fiu":
+                raise ValueError(f"expected numbers of shape ({size},) for {name}, found {dtype} of shape {shape}")
+            columns.append(np.frombuffer(data.read(size * dtype.itemsize), dtype, size).astype(np.float64))
+    return columns
 
 
 def _settings(root: Table, species: tuple[str, ...]) -> Settings:
     solver, output = root.table("solver"), root.table("output")
     name = solver.choice("name", tuple(SOLVERS), "RKL2")
+    if name in _SPLITTING and root.peek("kinetics") and root.peek("kinetics").get("name") == "cahn-hilliard":
+        whole = [one for one in SOLVERS if one not in _SPLITTING]
+        raise solver.error("name", f"one that does not split the rate, which cahn-hilliard needs ({', '.join(whole)}),")
     dt = solver.number("dt", 0.0, least=0.0)
     if name == "SBDF2" and not dt:
         raise solver.error("dt", "the length of steps, which SBDF2 needs,")
+    scheme = solver.choice("scheme", SCHEMES, "monotone")
+    if scheme != "polynomial" and "degree" in solver:
+        raise solver.error("degree", "no degree, which only the scheme polynomial has,")
     settings = Settings(
-        scheme=solver.choice("scheme", SCHEMES, "monotone"),
+        scheme=scheme,
+        degree=solver.count("degree", 4, 3, 4) if scheme == "polynomial" else None,
         dtype=solver.choice("dtype", ("float32", "float64"), "float64"),
         solver=None if name == "RKL2" else SOLVERS[name](),
         rtol=solver.number("rtol", 1e-4, 1e-14, 1e-1),
@@ -437,6 +508,7 @@ def _settings(root: Table, species: tuple[str, ...]) -> Settings:
         dt=dt or None,
         show=output.choice("show", species, species[0]),
         colormap=output.choice("colormap", tuple(COLORMAPS), "viridis"),
+        displacement=output.number("displacement", 0.0, -1e3, 1e3),
     )
     solver.finish()
     output.finish()

@@ -5,8 +5,9 @@ slider, a choice of species and colours, the value under the pointer, and pictur
 
 The page stores the geometry once: positions in 16 bits of the bounding box, faces in 32. The states of each species are
 stored in 16 bits of the range they take over all times (65535 where not finite), as differences from the frame before,
-low bytes apart from high ones, deflated. It is drawn by three.js (MIT licence, beside this file); viewer.js says how
-the bundle is made.
+low bytes apart from high ones, deflated. Where this makes a page of more than 14 MB (or, of more vertices and times
+than 40,000 and 100, more than 3.5 letters for each), states are rounded to as few bits as fit, eight at least. The page
+is drawn by three.js (MIT licence, beside this file); viewer.js says how the bundle is made.
 """
 
 import base64
@@ -22,6 +23,10 @@ import numpy as np
 from ..colors import COLORMAPS, colormap_samples
 
 _MISSING = 65535
+# Letters of the states of a page: what opens on a phone, and of larger runs so many for each vertex and time.
+_PAGE, _LETTERS = 14_000_000, 3.5
+# Least number of bits that a state is rounded to.
+_FEWEST = 8
 
 
 def viewer_html(
@@ -50,18 +55,19 @@ def viewer_html(
     colormap_samples(colormap)
     if not fields or len(times) == 0:
         raise ValueError("Expected at least one species at one time, found none.")
-    for name, values in fields.items():
-        if np.shape(values) != (len(times), len(vertices)):
-            raise ValueError(f"Expected {name} of shape {(len(times), len(vertices))}, found {np.shape(values)}.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     span = np.where(high > low, high - low, 1.0)
     arrays = dict(
-        positions=np.round((vertices - low) / span * 65535).astype("<u2").tobytes(),
-        faces=faces.astype("<u4").tobytes(),
+        positions=_compressed(np.round((vertices - low) / span * 65535).astype("<u2").tobytes()),
+        faces=_compressed(faces.astype("<u4").tobytes()),
     )
+    room_for_each = (max(_PAGE, _LETTERS * len(vertices) * len(times)) - sum(map(len, arrays.values()))) / len(fields)
     species = []
     for index, (name, values) in enumerate(fields.items()):
-        limits, arrays[f"field-{index}"] = _packed(np.asarray(values, np.float64))
+        if np.shape(values) != (len(times), len(vertices)):
+            raise ValueError(f"Expected {name} of shape {(len(times), len(vertices))}, found {np.shape(values)}.")
+        limits, whole = _quantised(np.asarray(values))
+        arrays[f"field-{index}"] = _packed(whole, room_for_each)
         species.append(dict(name=name, low=limits[0], high=limits[1]))
     header = dict(
         title=title,
@@ -74,14 +80,15 @@ def viewer_html(
         colormaps={name: samples.tolist() for name, samples in COLORMAPS.items()},
     )
     scripts = [_script("header", "application/json", json.dumps(header).replace("<", "\\u003c"))]
-    for name, data in arrays.items():
-        text = base64.b64encode(zlib.compress(data, 9)).decode("ascii")
-        scripts.append(_script(name, "text/plain", text))
+    scripts += [_script(name, "text/plain", text) for name, text in arrays.items()]
     room = files("ltljax.output.viewer")
     page = room.joinpath("viewer.html").read_text(encoding="utf-8")
     # Nothing in the bundle may end the script it stands in.
     bundle = room.joinpath("bundle.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
-    return page.replace("@data@", "\n".join(scripts)).replace("@bundle@", bundle)
+    # Split once: a title may spell the marks too.
+    before, rest = page.split("@data@")
+    between, after = rest.split("@bundle@")
+    return "".join([before, "\n".join(scripts), between, bundle, after])
 
 
 def write_viewer(
@@ -117,13 +124,40 @@ def _script(name: str, kind: str, text: str) -> str:
     return f'<script id="{name}" type="{kind}">{text}</script>'
 
 
-def _packed(values: np.ndarray) -> tuple[tuple[float, float], bytes]:
-    """The range of the values (T, V), and their bytes as the page reads them."""
-    is_finite = np.isfinite(values)
-    low, high = (float(values[is_finite].min()), float(values[is_finite].max())) if is_finite.any() else (0.0, 1.0)
+def _compressed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, 7)).decode("ascii")
+
+
+def _quantised(values: np.ndarray) -> tuple[tuple[float, float], np.ndarray]:
+    """The range of the values (T, V), and where in it each lies, in 16 bits."""
+    low, high = np.inf, -np.inf
+    for frame in values:
+        finite = frame[np.isfinite(frame)]
+        low, high = min(low, finite.min(initial=np.inf)), max(high, finite.max(initial=-np.inf))
+    low, high = (float(low), float(high)) if low <= high else (0.0, 1.0)
     if not high > low:
         high = low + max(abs(low), 1.0) * 1e-3
-    share = (np.where(is_finite, values, low) - low) / (high - low)
-    whole = np.where(is_finite, np.round(share * (_MISSING - 1)), _MISSING).astype(np.uint16)
-    change = np.diff(whole, axis=0, prepend=np.zeros((1, values.shape[1]), np.uint16))
-    return (low, high), (change & 255).astype(np.uint8).tobytes() + (change >> 8).astype(np.uint8).tobytes()
+    whole = np.empty(values.shape, np.uint16)
+    for frame, target in zip(values, whole, strict=True):
+        is_finite = np.isfinite(frame)
+        share = (np.where(is_finite, frame, low).astype(np.float64) - low) / (high - low)
+        target[:] = np.where(is_finite, np.round(share * (_MISSING - 1)), _MISSING)
+    return (low, high), whole
+
+
+def _packed(whole: np.ndarray, most: float) -> str:
+    """The states (T, V) as the page reads them, rounded to so many bits that they take at most so many letters."""
+    bits = 16
+    while True:
+        # The largest multiple may lie half a step beyond the range.
+        step = 1 << (16 - bits)
+        largest = (_MISSING - 1) // step * step
+        rounded = np.minimum((whole.astype(np.uint32) + step // 2) // step * step, largest).astype(np.uint16)
+        rounded = np.where(whole == _MISSING, np.uint16(_MISSING), rounded)
+        change = np.diff(rounded, axis=0, prepend=np.zeros((1, whole.shape[1]), np.uint16))
+        text = _compressed((change & 255).astype(np.uint8).tobytes() + (change >> 8).astype(np.uint8).tobytes())
+        if len(text) <= most or bits == _FEWEST:
+            return text
+        # One bit of each state is an eighth of a byte, and three bytes are four letters.
+        excess = (len(text) - most) / whole.size * 6
+        bits = max(_FEWEST, bits - max(1, int(np.ceil(excess))))

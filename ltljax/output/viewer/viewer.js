@@ -123,8 +123,9 @@ async function start() {
   const { center, radius } = geometry.boundingSphere;
 
   const state = { at: 0, species: 0, colormap: header.colormap, playing: false, shown: [-1, -1, -1] };
-  let stale = true;
-  const refresh = () => { stale = true; };
+  let stale = true, moved = false;
+  // What is seen has changed, and with it what lies under the pointer.
+  const refresh = () => { stale = moved = true; };
   controls.addEventListener("change", refresh);
 
   function resetView() {
@@ -225,11 +226,16 @@ async function start() {
     return { value, vertex: [a, b, c][weights.indexOf(Math.max(...weights))] };
   }
 
-  let pointer = null, asked = 0;
-  function point(event) { pointer = [event.clientX, event.clientY]; }
+  let pointer = null, asked = 0, answers = 0;
+  function point(event) {
+    pointer = [event.clientX, event.clientY];
+    moved = true;
+  }
   function tell(now) {
-    if (pointer === null || now - asked < 60) return;
+    if (pointer === null || !moved || now - asked < 60) return;
     asked = now;
+    moved = false;
+    answers += 1;
     const found = valueAt(...pointer);
     const label = by("value");
     label.hidden = found === null;
@@ -262,7 +268,11 @@ async function start() {
   by("save").addEventListener("click", savePicture);
   canvas.addEventListener("pointermove", point);
   canvas.addEventListener("pointerdown", point);
-  canvas.addEventListener("pointerleave", () => { pointer = null; by("value").hidden = true; });
+  canvas.addEventListener("pointerleave", (event) => {
+    if (event.pointerType === "touch") return; // a finger that is lifted: what it touched stays to be read
+    pointer = null;
+    by("value").hidden = true;
+  });
   window.addEventListener("resize", resize);
   window.addEventListener("keydown", (event) => {
     if (event.target instanceof HTMLSelectElement) return;
@@ -304,6 +314,8 @@ async function start() {
     get frame() { return state.at; },
     get playing() { return state.playing; },
     get drawn() { return drawn; },
+    get answers() { return answers; },
+    get distance() { return camera.position.distanceTo(controls.target); },
     // What is stored of one vertex in one frame.
     stored(species, frame, vertex) {
       const { low, high } = header.species[species], whole = states[species][frame * size + vertex];

@@ -1,0 +1,78 @@
+"""The folder of a run: copies of the files it was made from, and nothing of the user's replaced.
+
+What enters: the folder, the name of the run, the files it reads. What leaves: copies of these under ``inputs``, or an
+`OutputError` before anything is computed.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+# What a run writes beside its series, by ending.
+_ENDINGS = ("html", "pvd", "ply", "glb", "png", "mp4", "gif")
+_COPIES = "inputs"
+
+
+class OutputError(ValueError):
+    """A folder in which the results would replace what is no result."""
+
+
+def check_folder(out: Path, name: str, inputs: Iterable[Path], copies: Mapping[str, Path]) -> None:
+    """Raise where the results would replace one of the inputs, or a file that no run has written.
+
+    Args:
+        out: the folder, which may be absent.
+        name: of the run, with which the names of its results begin.
+        inputs: the files that are read.
+        copies: those of them of which copies will be kept, as of `keep_inputs`.
+
+    Raises:
+        OutputError: it names the file and what to do.
+    """
+    textured = [f"textured/{name}.{ending}" for ending in ("obj", "mtl", "png")]
+    results = [f"{name}.{ending}" for ending in _ENDINGS]
+    results += [f"{name}-displaced.glb", "summary.json", "scenario.toml", *textured]
+    there = [path for path in (out / result for result in results) if path.exists()]
+    there += sorted((out / "series").glob(f"{name}_*.vtp"))
+    targets = {out / _copy(key, file): file for key, file in copies.items()}
+    read = [path for path in inputs if path.exists()]
+    for path in [*there, *targets]:
+        replaced = [file for file in read if path.exists() and path.samefile(file)]
+        if replaced and not (path in targets and path.samefile(targets[path])):
+            raise OutputError(f"The results in {out} would replace {path}, which the run reads. Name another --out.")
+    if there and not _is_of_a_run(out):
+        raise OutputError(f"The results would replace {there[0]}, which no run has written. Name another --out.")
+
+
+def keep_inputs(out: Path, files: Mapping[str, Path]) -> dict[str, str]:
+    """Copy files into the folder; returns their names relative to it.
+
+    Args:
+        out: the folder.
+        files: by the dotted key that names each, as ``{"mesh.file": Path("spot.obj")}``. Each goes into a folder of
+            its own, so that equal names stay apart.
+    """
+    kept = {key: _copy(key, file) for key, file in files.items()}
+    for key, file in files.items():
+        target = out / kept[key]
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not (target.exists() and target.samefile(file)):
+            shutil.copyfile(file, target)
+    return kept
+
+
+def _copy(key: str, file: Path) -> str:
+    """Where the copy of an input lies: in a folder named by the tables that name the input."""
+    return "/".join([_COPIES, "-".join(key.split(".")[:-1]), file.name])
+
+
+def _is_of_a_run(out: Path) -> bool:
+    """Whether a run has written to a folder, or was interrupted there."""
+    if (out / "restart" / "progress.json").exists():
+        return True
+    try:
+        found = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and {"scenario", "versions", "files"} <= found.keys()
