@@ -32,6 +32,8 @@ from .surface import Surface
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000
+# Bytes of a viewer's page from which on it is said.
+_LARGE_PAGE = 15_000_000
 
 
 @dataclasses.dataclass
@@ -253,6 +255,8 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     columns = {s: column for column, s in enumerate(example.species)}
     whole = _Series(states, order, {shown: columns[shown]} | columns)
     viewer.write_viewer(out / f"{name}.html", vertices, faces, times, whole, example.title or name, colormap)
+    if (size := (out / f"{name}.html").stat().st_size) > _LARGE_PAGE:
+        print(f"note: the viewer's page has {size / 1e6:.0f} MB, much for a phone. Fewer frames make it smaller.")
     if not pictures.can_draw():
         print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
         return written

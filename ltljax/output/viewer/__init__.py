@@ -4,10 +4,12 @@ What enters: NumPy arrays of a surface and of its states in time. What leaves: a
 slider, a choice of species and colours, the value under the pointer, and pictures to save.
 
 The page stores the geometry once: positions in 16 bits of the bounding box, faces in 32. The states of each species are
-stored in 16 bits of the range they take over all times (65535 where not finite), as differences from the frame before,
-low bytes apart from high ones, deflated. Where this makes a page of more than 14 MB (or, of more vertices and times
-than 40,000 and 100, more than 3.5 letters for each), states are rounded to as few bits as fit, eight at least. The page
-is drawn by three.js (MIT licence, beside this file); viewer.js says how the bundle is made.
+stored as whole numbers of steps, into 65,534 of which the range they take over all times is divided (65535 where not
+finite), as differences from the frame before (0, -1, 1, -2, ... as 0, 1, 2, 3, ...), low bytes apart from high ones,
+deflated. Where this makes a page of more than 14 MB (or, of more vertices and times than 40,000 and 100, more than 3.5
+letters for each) the steps are coarser: of two species in motion there are ten thousand left, of five a hundred and
+fifty; still more species make larger pages. It is drawn by three.js (MIT licence, beside this file); viewer.js says how
+the bundle is made.
 """
 
 import base64
@@ -25,8 +27,8 @@ from ..colors import COLORMAPS, colormap_samples
 _MISSING = 65535
 # Letters of the states of a page: what opens on a phone, and of larger runs so many for each vertex and time.
 _PAGE, _LETTERS = 14_000_000, 3.5
-# Least number of bits that a state is rounded to.
-_FEWEST = 8
+# Into how many steps a range is divided, at the most and at the least.
+_FINEST, _COARSEST = 65534, 127
 
 
 def viewer_html(
@@ -67,8 +69,8 @@ def viewer_html(
         if np.shape(values) != (len(times), len(vertices)):
             raise ValueError(f"Expected {name} of shape {(len(times), len(vertices))}, found {np.shape(values)}.")
         limits, whole = _quantised(np.asarray(values))
-        arrays[f"field-{index}"] = _packed(whole, room_for_each)
-        species.append(dict(name=name, low=limits[0], high=limits[1]))
+        steps, arrays[f"field-{index}"] = _packed(whole, room_for_each)
+        species.append(dict(name=name, low=limits[0], high=limits[1], steps=steps))
     header = dict(
         title=title,
         vertices=len(vertices),
@@ -129,7 +131,7 @@ def _compressed(data: bytes) -> str:
 
 
 def _quantised(values: np.ndarray) -> tuple[tuple[float, float], np.ndarray]:
-    """The range of the values (T, V), and where in it each lies, in 16 bits."""
+    """The range of the values (T, V), and where in it each lies, in the finest steps."""
     low, high = np.inf, -np.inf
     for frame in values:
         finite = frame[np.isfinite(frame)]
@@ -141,23 +143,22 @@ def _quantised(values: np.ndarray) -> tuple[tuple[float, float], np.ndarray]:
     for frame, target in zip(values, whole, strict=True):
         is_finite = np.isfinite(frame)
         share = (np.where(is_finite, frame, low).astype(np.float64) - low) / (high - low)
-        target[:] = np.where(is_finite, np.round(share * (_MISSING - 1)), _MISSING)
+        target[:] = np.where(is_finite, np.round(share * _FINEST), _MISSING)
     return (low, high), whole
 
 
-def _packed(whole: np.ndarray, most: float) -> str:
-    """The states (T, V) as the page reads them, rounded to so many bits that they take at most so many letters."""
-    bits = 16
+def _packed(whole: np.ndarray, most: float) -> tuple[int, str]:
+    """Into how many steps the range is divided, and the states (T, V), of at most so many letters if that can be."""
+    steps = _FINEST
     while True:
-        # The largest multiple may lie half a step beyond the range.
-        step = 1 << (16 - bits)
-        largest = (_MISSING - 1) // step * step
-        rounded = np.minimum((whole.astype(np.uint32) + step // 2) // step * step, largest).astype(np.uint16)
-        rounded = np.where(whole == _MISSING, np.uint16(_MISSING), rounded)
+        rounded = (whole.astype(np.uint32) * steps + _FINEST // 2) // _FINEST
+        rounded = np.where(whole == _MISSING, _MISSING, rounded).astype(np.uint16)
         change = np.diff(rounded, axis=0, prepend=np.zeros((1, whole.shape[1]), np.uint16))
+        signed = change.view(np.int16)
+        change = ((signed << 1) ^ (signed >> 15)).view(np.uint16)
         text = _compressed((change & 255).astype(np.uint8).tobytes() + (change >> 8).astype(np.uint8).tobytes())
-        if len(text) <= most or bits == _FEWEST:
-            return text
+        if len(text) <= most or steps == _COARSEST:
+            return steps, text
         # One bit of each state is an eighth of a byte, and three bytes are four letters.
         excess = (len(text) - most) / whole.size * 6
-        bits = max(_FEWEST, bits - max(1, int(np.ceil(excess))))
+        steps = max(_COARSEST, int(steps / 2 ** max(excess, 0.25)))

@@ -21,12 +21,13 @@ async function inflate(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Low bytes first, then high ones, each the difference from the frame before.
+// Low bytes first, then high ones, of the differences from the frame before: 0, -1, 1, -2, ... as 0, 1, 2, 3, ...
 function frames(bytes, count, size) {
   const values = new Uint16Array(count * size);
   const high = count * size;
   for (let i = 0; i < count * size; i++) {
-    const change = bytes[i] | (bytes[high + i] << 8);
+    const kept = bytes[i] | (bytes[high + i] << 8);
+    const change = ((kept >>> 1) ^ -(kept & 1)) & 65535;
     values[i] = i < size ? change : (values[i - size] + change) & 65535;
   }
   return values;
@@ -55,13 +56,14 @@ const VERTEX = `
   attribute float before;
   attribute float after;
   uniform float share;
+  uniform float steps;
   varying float value;
   varying float missing;
   varying vec3 facing;
   varying vec3 seen;
   void main() {
     missing = max(step(0.99999, before), step(0.99999, after));
-    value = mix(before, after, share) * 65535.0 / 65534.0;
+    value = mix(before, after, share) * 65535.0 / steps;
     vec4 there = modelViewMatrix * vec4(position, 1.0);
     facing = normalMatrix * normal;
     seen = -there.xyz;
@@ -107,7 +109,7 @@ async function start() {
   geometry.setAttribute("before", before);
   geometry.setAttribute("after", after);
   const maps = Object.fromEntries(Object.entries(header.colormaps).map(([name, rows]) => [name, shades(rows)]));
-  const uniforms = { map: { value: null }, samples: { value: 1 }, share: { value: 0 } };
+  const uniforms = { map: { value: null }, samples: { value: 1 }, share: { value: 0 }, steps: { value: 1 } };
   const material = new ShaderMaterial({ uniforms, vertexShader: VERTEX, fragmentShader: FRAGMENT, side: DoubleSide });
   const mesh = new Mesh(geometry, material);
   const scene = new Scene();
@@ -176,7 +178,8 @@ async function start() {
 
   function setSpecies(name) {
     state.species = Math.max(0, header.species.findIndex((one) => one.name === name));
-    const { low, high } = header.species[state.species];
+    const { low, high, steps } = header.species[state.species];
+    uniforms.steps.value = steps;
     by("low").textContent = pretty(low);
     by("high").textContent = pretty(high);
     by("species").value = header.species[state.species].name;
@@ -216,12 +219,12 @@ async function start() {
       const [p, q] = [spots[(i + 1) % 3], spots[(i + 2) % 3]];
       return new Vector3().subVectors(p, hit.point).cross(new Vector3().subVectors(q, hit.point)).length() / total;
     });
-    const { low, high } = header.species[state.species];
+    const { low, high, steps } = header.species[state.species];
     let value = 0;
     [a, b, c].forEach((vertex, i) => {
       const [first, second] = [before.array[vertex], after.array[vertex]];
       const whole = first === MISSING || second === MISSING ? NaN : first + (second - first) * uniforms.share.value;
-      value += weights[i] * (low + ((high - low) * whole) / 65534);
+      value += weights[i] * (low + ((high - low) * whole) / steps);
     });
     return { value, vertex: [a, b, c][weights.indexOf(Math.max(...weights))] };
   }
@@ -318,8 +321,8 @@ async function start() {
     get distance() { return camera.position.distanceTo(controls.target); },
     // What is stored of one vertex in one frame.
     stored(species, frame, vertex) {
-      const { low, high } = header.species[species], whole = states[species][frame * size + vertex];
-      return whole === MISSING ? NaN : low + ((high - low) * whole) / 65534;
+      const { low, high, steps } = header.species[species], whole = states[species][frame * size + vertex];
+      return whole === MISSING ? NaN : low + ((high - low) * whole) / steps;
     },
   };
 }
