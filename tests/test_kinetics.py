@@ -153,6 +153,39 @@ def test_explain_tells_what_stands_in_the_way(sphere):
     assert "finite push" in str(ltl.explain(waves, sphere))
 
 
+def test_explain_calls_a_centre_neutral(sphere):
+    equation = ltl.ReactionDiffusion((0.002, 0.002), ltl.kinetics.lotka_volterra(growth=4.0))
+    found = ltl.explain(equation, sphere)
+    assert not found.forms_pattern
+    assert "(1, 4) is neutral" in str(found)
+    # The frequency at the centre is sqrt(a c).
+    assert "in the time 3.142" in str(found)
+    assert found.dispersion.band is None
+
+
+def test_explain_tells_waves_from_a_pattern(sphere):
+    """Two species that oscillate, and grow, but for a third that holds them back where it does not diffuse away."""
+
+    def rates(species, p):
+        u, v, w = species
+        return 0.5 * u - 2 * v - w, 2 * u, 10 * (u - w)
+
+    equation = ltl.ReactionDiffusion((1e-2, 1e-2, 10.0), ltl.kinetics.Kinetics(rates, None, ("u", "v", "w")))
+    found = ltl.explain(equation, sphere, (0.0, 0.0, 0.0))
+    at, rate = found.dispersion.fastest
+    values = np.linalg.eigvals(np.asarray(found.dispersion.jacobian) - at * np.diag([1e-2, 1e-2, 10.0]))
+    leading = values[values.real.argmax()]
+    assert at > 1
+    assert rate == pytest.approx(leading.real)
+    assert rate > 0
+    assert float(found.dispersion.frequency(at)) == pytest.approx(abs(leading.imag))
+    assert abs(leading.imag) > 1
+    assert float(found.dispersion.growth(0.0)) < 0
+    assert not found.forms_pattern
+    assert not found.dispersion.forms_pattern
+    assert "Waves, and no stationary pattern" in str(found)
+
+
 def pattern(level, diffusivity, kinetics, t1, amplitude=0.1, seed=0):
     """A pattern on the sphere out of a start that does not depend on the mesh, its surface and its mesh."""
     mesh = ltl.shapes.icosphere(level)

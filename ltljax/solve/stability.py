@@ -27,6 +27,8 @@ from .modes import eigenmodes
 _SAMPLES = 2000
 # Fewer edges in a wavelength than this leave an error of five percent and more in the eigenvalue.
 _EDGES = 8
+# Growth rates of less than this share of the reaction's own rates are rounding.
+_ROUNDING = 1e-12
 # More modes than this are counted by Weyl's law.
 _MODES = 150
 
@@ -49,9 +51,7 @@ class Dispersion(eqx.Module):
 
         Differentiable with respect to parameters and lambda. Source: Turing (1952), doi:10.1098/rstb.1952.0012.
         """
-        eigenvalue = jnp.asarray(eigenvalue, self.jacobian.dtype)
-        decay = jnp.tensordot(eigenvalue, jnp.diag(self.diffusivity), axes=0)
-        matrices = jnp.broadcast_to(self.jacobian, decay.shape) - decay
+        matrices = self._matrices(eigenvalue)
         if self.diffusivity.size > 2:
             return jnp.max(jnp.linalg.eigvals(matrices).real, axis=-1)
         if self.diffusivity.size == 1:
@@ -61,11 +61,17 @@ class Dispersion(eqx.Module):
         # The root is real or imaginary; the inner choice keeps the derivative of the other one finite.
         return half + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
+    def frequency(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "..."]:
+        """The angular frequency at which the mode that grows fastest oscillates: zero where it does not."""
+        values = jnp.linalg.eigvals(self._matrices(eigenvalue))
+        leading = jnp.argmax(values.real, axis=-1, keepdims=True)
+        return jnp.abs(jnp.take_along_axis(values.imag, leading, axis=-1))[..., 0]
+
     @functools.cached_property
     def band(self) -> tuple[float, float] | None:
         """The eigenvalues of -Delta between which modes grow, or None; infinite where no end is found (host)."""
         samples = self._samples()
-        is_growing = np.asarray(self.growth(samples)) > 0
+        is_growing = np.asarray(self.growth(samples)) > self._rounding
         if not is_growing.any():
             return None
         first, last = np.flatnonzero(is_growing)[[0, -1]]
@@ -91,8 +97,23 @@ class Dispersion(eqx.Module):
 
     @property
     def forms_pattern(self) -> bool:
-        """Whether the uniform state is stable by itself and unstable with diffusion: Turing's instability (host)."""
-        return self.band is not None and float(self.growth(0.0)) <= 0
+        """Whether the uniform state is stable by itself and diffusion makes stationary modes grow fastest: Turing's
+        instability (host)."""
+        return self.band is not None and float(self.growth(0.0)) <= self._rounding and not self.makes_waves
+
+    @property
+    def makes_waves(self) -> bool:
+        """Whether the mode that grows fastest, or decays slowest, oscillates as it does (host)."""
+        return float(self.frequency(self.fastest[0])) > self._rounding
+
+    @property
+    def _rounding(self) -> float:
+        return _ROUNDING * float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
+
+    def _matrices(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "... S S"]:
+        eigenvalue = jnp.asarray(eigenvalue, self.jacobian.dtype)
+        decay = jnp.tensordot(eigenvalue, jnp.diag(self.diffusivity), axes=0)
+        return jnp.broadcast_to(self.jacobian, decay.shape) - decay
 
     def _samples(self) -> np.ndarray:
         diffusivity, size = np.asarray(self.diffusivity), float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
@@ -102,7 +123,7 @@ class Dispersion(eqx.Module):
         return np.concatenate([[0.0], np.geomspace(1e-7 * largest, 1.01 * largest, _SAMPLES)])
 
     def _root(self, low: Any, high: Any) -> float:
-        found: Any = scipy.optimize.brentq(lambda x: float(self.growth(x)), low, high)
+        found: Any = scipy.optimize.brentq(lambda x: float(self.growth(x)) - self._rounding, low, high)
         return float(found)
 
 
@@ -150,7 +171,7 @@ class Explanation:
     """What linear theory says of a run before it starts; prints as text.
 
     Attributes:
-        forms_pattern: whether a stationary pattern grows out of the uniform state on this surface.
+        forms_pattern: whether a stationary pattern grows out of the uniform state on this surface; waves are none.
         dispersion: the growth rates.
         num_modes: how many modes of the surface grow.
         wavelength: of the mode that grows fastest; infinite where none does.
@@ -188,9 +209,17 @@ def explain(
     state = ", ".join(f"{x:.4g}" for x in np.asarray(found.steady_state))
     band, (fastest, rate) = found.band, found.fastest
     alone = float(found.growth(0.0))
-    if alone > 1e-9:
+    if alone > found._rounding:
         reason = f"The uniform state ({state}) is unstable without diffusion already, at the rate {alone:.3g}"
         message = f"{reason}: it is left everywhere at once, by oscillation or for another state."
+        return Explanation(False, found, 0, float("inf"), float("inf"), message)
+    if alone >= -found._rounding and band is None:
+        turning = float(found.frequency(0.0))
+        how = f"turn about it in the time {2 * np.pi / turning:.4g} and " if turning > found._rounding else ""
+        message = (
+            f"No pattern: the uniform state ({state}) is neutral. Small departures that are uniform {how}neither grow "
+            "nor decay, and none that varies over the surface grows. What larger ones do linear theory cannot tell."
+        )
         return Explanation(False, found, 0, float("inf"), float("inf"), message)
     if band is None or rate <= 0:
         message = (
@@ -208,13 +237,20 @@ def explain(
     if count == 0:
         message = f"No pattern: {shape}, but this surface has no such mode: it is too small for the wavelength."
         return Explanation(False, found, 0, wavelength, edges, message)
-    message = f"A pattern forms: {shape}. This surface has {'' if known else 'about '}{count} such modes. The mesh " + (
-        f"resolves the pattern, with {edges:.0f} edges in a wavelength."
-        if edges >= _EDGES
-        else f"does not resolve it: {edges:.1f} edges in a wavelength, and {_EDGES} are wanted. Refine the mesh or "
-        "enlarge the diffusivities."
-    )
-    return Explanation(True, found, count, wavelength, edges, message)
+    waves = found.makes_waves
+    if waves:
+        begins = f"Waves, and no stationary pattern, form (period {2 * np.pi / float(found.frequency(fastest)):.4g})"
+    else:
+        begins = "A pattern forms"
+    if edges >= _EDGES:
+        seen = f"resolves {'them' if waves else 'the pattern'}, with {edges:.0f} edges in a wavelength."
+    else:
+        seen = (
+            f"does not resolve {'them' if waves else 'it'}: {edges:.1f} edges in a wavelength, {_EDGES} are wanted. "
+            "Refine the mesh or enlarge the diffusivities."
+        )
+    message = f"{begins}: {shape}. This surface has {'' if known else 'about '}{count} such modes. The mesh {seen}"
+    return Explanation(not waves, found, count, wavelength, edges, message)
 
 
 def _mean_diffusivities(equation: ReactionDiffusion, surface: Surface) -> Array:
