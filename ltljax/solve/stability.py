@@ -27,6 +27,8 @@ from .modes import eigenmodes
 _SAMPLES = 2000
 # Fewer edges in a wavelength than this leave an error of five percent and more in the eigenvalue.
 _EDGES = 8
+# A pattern that grows so many times as fast as uniform departures is seen before them.
+_FASTER = 2.0
 # Growth rates of less than this share of the reaction's own rates are rounding.
 _ROUNDING = 1e-12
 # More modes than this are counted by Weyl's law.
@@ -209,7 +211,8 @@ def explain(
     state = ", ".join(f"{x:.4g}" for x in np.asarray(found.steady_state))
     band, (fastest, rate) = found.band, found.fastest
     alone = float(found.growth(0.0))
-    if alone > found._rounding:
+    outgrown = alone > found._rounding and fastest > 0 and rate > _FASTER * alone and not found.makes_waves
+    if alone > found._rounding and not outgrown:
         reason = f"The uniform state ({state}) is unstable without diffusion already, at the rate {alone:.3g}"
         message = f"{reason}: it is left everywhere at once, by oscillation or for another state."
         return Explanation(False, found, 0, float("inf"), float("inf"), message)
@@ -249,6 +252,8 @@ def explain(
             f"does not resolve {'them' if waves else 'it'}: {edges:.1f} edges in a wavelength, {_EDGES} are wanted. "
             "Refine the mesh or enlarge the diffusivities."
         )
+    if outgrown:
+        shape += f"; without them it would be left more slowly, everywhere at once (rate {alone:.3g})"
     message = f"{begins}: {shape}. This surface has {'' if known else 'about '}{count} such modes. The mesh {seen}"
     return Explanation(not waves, found, count, wavelength, edges, message)
 
