@@ -6,6 +6,7 @@ python docs/gallery.py [NAME ...]
 import argparse
 import contextlib
 import io
+import shlex
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +17,19 @@ from ltljax import scenario
 from ltljax.cli import main as ltljax
 
 HERE = Path(__file__).parent
+MESHES = HERE.parents[1] / "shared" / "meshes"
+# Patterns on other surfaces: title, words, scenario, mesh, and what is changed of it.
+SURFACES = {
+    "disk": (
+        "A labyrinth on a disk", "Nothing flows through the boundary, which the stripes meet at right angles.",
+        "fitzhugh-nagumo", "disk", ["diffusivity.u=5e-4", "diffusivity.v=5e-2"],
+    ),
+    "hand": (
+        "Rings on an open hand", "Stripes along the greatest curvature go around fingers. (A scan with a boundary, of\n"
+        "the Max Planck Society, CC BY 4.0; its 810 vertices want a coarser pattern.)",
+        "rings", "hand_open.obj", ['diffusivity.u="0.516*0.012"', "diffusivity.v=0.012", "time.end=600"],
+    ),
+}  # fmt: skip
 
 
 def main():
@@ -23,20 +37,29 @@ def main():
     parser.add_argument("names", nargs="*", help="only these (default: all)")
     names = parser.parse_args().names
     texts = scenario.library()
-    for name in names or texts:
+    for name in names or [*texts, *SURFACES]:
         start = time.perf_counter()
         picture(name)
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
     (HERE / "gallery.md").write_text(page(texts), encoding="utf-8")
 
 
+def command(name):
+    """What makes the picture of a name."""
+    if name not in SURFACES:
+        return ["run", name]
+    _, _, scene, mesh, changes = SURFACES[name]
+    return ["run", scene, "--mesh", mesh, *(part for change in changes for part in ("--set", change))]
+
+
 def picture(name):
     with tempfile.TemporaryDirectory() as folder:
+        arguments = [str(MESHES / part) if part.endswith(".obj") else part for part in command(name)]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            code = ltljax(["run", name, "--out", folder])
+            code = ltljax([*arguments, "--out", folder])
         if code:
             raise SystemExit(f"{name} ended with {code}")
-        image = Image.open(Path(folder) / f"{name}.png").resize((720, 360), Image.Resampling.LANCZOS)
+        image = Image.open(Path(folder) / f"{command(name)[1]}.png").resize((720, 360), Image.Resampling.LANCZOS)
         (HERE / "gallery").mkdir(exist_ok=True)
         image.convert("P", palette=Image.Palette.ADAPTIVE, colors=128).save(
             HERE / "gallery" / f"{name}.png", optimize=True
@@ -48,14 +71,17 @@ def page(texts):
         "# Patterns", "",
         "Each is a file that comes with the package: `ltljax run NAME` makes the picture, with a viewer, data and an",
         "animation; `ltljax new NAME > my.toml` writes the file down, to be changed and run. Add `--mesh my.obj` for",
-        "a surface of your own, as in this picture of zebra, spirals, barrio-spots and gray-scott, and",
-        "`--set KEY=VALUE` for other values. The pictures below are made by `python docs/gallery.py`.", "",
+        "a surface of your own, as in this picture of zebra, spirals (with diffusivity.u=0.01), barrio-spots and",
+        "gray-scott, and `--set KEY=VALUE` for other values. `python docs/gallery.py` makes the pictures below.", "",
         "![Four patterns on a cow, a torus and a rabbit](patterns.png)",
     ]  # fmt: skip
     for name, text in texts.items():
         about = text.splitlines()[0].removeprefix("# ")
         lines += ["", f"## {scenario.title(text)}", "", about, "", f"    ltljax run {name}", ""]
         lines += [f"![{scenario.title(text)}](gallery/{name}.png)"]
+    for name, (heading, about, *_) in SURFACES.items():
+        lines += ["", f"## {heading}", "", about, "", f"    ltljax {shlex.join(command(name))}", ""]
+        lines += [f"![{heading}](gallery/{name}.png)"]
     return "\n".join(lines) + "\n"
 
 

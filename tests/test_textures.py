@@ -1,10 +1,14 @@
 """Fields as colours and textures that other programs open again."""
 
+import tomllib
+
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 import ltljax as ltl
+from ltljax import scenario
 from ltljax.cli import main
 from ltljax.output import colors, files, texture
 
@@ -159,3 +163,72 @@ def test_a_run_on_a_mesh_with_a_map_writes_its_texture(tmp_path):
     assert main(["run", "allen-cahn", *arguments]) == 0
     opened = trimesh.load(tmp_path / "out" / "textured" / "allen-cahn.obj", force="mesh")
     assert opened.visual.material.image.size == (1024, 1024)
+
+
+def unwrapped(path, mesh):
+    """An OBJ of a mesh with a UV map in which each face has a cell of its own."""
+    side = int(np.ceil(np.sqrt(mesh.num_faces)))
+    column, row = np.arange(mesh.num_faces) % side, np.arange(mesh.num_faces) // side
+    corner = np.array([[0.15, 0.15], [0.85, 0.15], [0.15, 0.85]])
+    uv = (np.stack([column, row], axis=1)[:, None] + corner) / side
+    texture.write_textured_obj(path, mesh.vertices, mesh.faces, uv, np.zeros((4, 4, 3), np.uint8))
+
+
+# On each surface a scenario, and what is changed of it.
+SURFACES = {
+    "spot": ("turk", ["--t1", "20", "--set", 'kinetics.decay="11 + 0.1*noise"']),
+    "bunny": ("barrio-spots", ["--set", 'diffusivity.u="0.516*0.006"', "--set", "diffusivity.v=0.006"]),
+    "disk": ("fitzhugh-nagumo", ["--set", "diffusivity.u=5e-4", "--set", "diffusivity.v=5e-2"]),
+    "torus": ("spirals", ["--t1", "10", "--set", "mesh.n_major=96", "--set", "mesh.n_minor=48"]),
+    "hand": ("rings", ["--t1", "600", "--set", 'diffusivity.u="0.516*0.012"', "--set", "diffusivity.v=0.012"]),
+}
+FILES = {"spot": "spot.obj", "bunny": "bunny_closed.obj", "hand": "hand_open.obj"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SURFACES)
+def test_five_scenarios_on_five_surfaces_show_a_pattern_that_opens_again(name, tmp_path, real_mesh):
+    pytest.importorskip("pyvista")
+    kind, changes = SURFACES[name]
+    given = name
+    if name in FILES:
+        given = str(tmp_path / f"{name}.obj")
+        unwrapped(tmp_path / f"{name}.obj", ltl.load_mesh(real_mesh(FILES[name])))
+    if name == "disk":
+        changes = [*changes, "--set", "mesh.rings=36"]
+    out = tmp_path / "out"
+    assert main(["run", kind, "--mesh", given, "--frames", "2", *changes, "--out", str(out)]) == 0
+
+    # In the picture: a surface of some size on white, in colours from both ends of the map, and a pattern with borders.
+    picture = np.asarray(Image.open(out / f"{kind}.png"))[..., :3].astype(float)
+    surface = (picture < 250).any(axis=2)
+    assert 0.1 < surface.mean() < 0.7
+    brightness = picture.mean(axis=2)[surface]
+    assert np.ptp(np.quantile(brightness, [0.05, 0.95])) > 50
+
+    shown = tomllib.loads(scenario.library()[kind]).get("output", {}).get("show", "u")
+    columns = pyvista_columns(out / "series" / f"{kind}_0002.vtp")
+    u = columns[shown]
+    assert u.std() > 0.1 * np.ptp(u)
+    (glb,) = trimesh.load(out / f"{kind}.glb", process=False).geometry.values()
+    colours = np.asarray(glb.visual.vertex_attributes["color"])
+    assert len(np.unique(colours[:, :3], axis=0)) > 100
+    ply = ltl.load_mesh(out / f"{kind}.ply")
+    np.testing.assert_array_equal(ply.faces, glb.faces)
+    if name not in FILES:
+        return
+    opened = trimesh.load(out / "textured" / f"{kind}.obj", force="mesh", process=False)
+    # The texture has the colours of the vertices, in the middle of each face.
+    places = opened.visual.uv[opened.faces].mean(axis=1)
+    baked = np.asarray(opened.visual.material.to_color(places))[:, :3] / 255.0
+    screen = trimesh.load(out / f"{kind}.ply", process=False).visual.vertex_colors[:, :3] / 255.0
+    means = screen[glb.faces].mean(axis=1)
+    even = np.ptp(screen[glb.faces], axis=1).max(axis=1) < 0.1
+    assert even.sum() > 100
+    assert np.abs(baked - means)[even].mean() < 0.05
+
+
+def pyvista_columns(path):
+    import pyvista
+
+    return dict(pyvista.read(path).point_data)
