@@ -55,10 +55,11 @@ def command(name):
 def picture(name):
     with tempfile.TemporaryDirectory() as folder:
         arguments = [str(MESHES / part) if part.endswith(".obj") else part for part in command(name)]
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            code = ltljax([*arguments, "--out", folder])
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            code = ltljax([*arguments, "--frames", "1", "--out", folder])  # of which the last is shown
         if code:
-            raise SystemExit(f"{name} ended with {code}")
+            raise SystemExit(f"{name} ended with {code}: {said.getvalue().splitlines()[-1]}")
         image = Image.open(Path(folder) / f"{command(name)[1]}.png").resize((720, 360), Image.Resampling.LANCZOS)
         (HERE / "gallery").mkdir(exist_ok=True)
         image.convert("P", palette=Image.Palette.ADAPTIVE, colors=128).save(
@@ -72,7 +73,8 @@ def page(texts):
         "Each is a file that comes with the package: `ltljax run NAME` makes the picture, with a viewer, data and an",
         "animation; `ltljax new NAME > my.toml` writes the file down, to be changed and run. Add `--mesh my.obj` for",
         "a surface of your own, as in this picture of zebra, spirals (with diffusivity.u=0.01), barrio-spots and",
-        "gray-scott, and `--set KEY=VALUE` for other values. `python docs/gallery.py` makes the pictures below.", "",
+        "gray-scott, and `--set KEY=VALUE` for other values: `--set output.displacement=0.05` also writes a surface",
+        "with the pattern as its relief. `python docs/gallery.py` makes the pictures below.", "",
         "![Four patterns on a cow, a torus and a rabbit](patterns.png)",
     ]  # fmt: skip
     for name, text in texts.items():

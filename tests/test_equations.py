@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import ltljax as ltl
 
@@ -116,6 +117,21 @@ def test_an_amount_on_a_growing_surface_is_diluted_and_conserved(sphere):
     assert jnp.linalg.norm(u - expected) < 2e-3 * jnp.linalg.norm(expected)
     moved = equation.surface_at(jnp.array(1.0), sphere)
     assert ltl.integrate(moved, u) == pytest.approx(float(ltl.integrate(sphere, u0[:, 0])), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_what_reacts_on_a_growing_surface_is_diluted_too(sphere):
+    """Uniform species follow u' = f(u) - 2 g u, the area of a sphere growing at the rate 2 g."""
+    growth, kinetics = 0.3, ltl.kinetics.schnakenberg(rate=1.0)
+    equation = ltl.Moving(ltl.ReactionDiffusion((0.05, 0.1), kinetics), lambda t, x: jnp.exp(growth * t) * x)
+    u0 = np.array([1.2, 0.7])
+    u = ltl.solve(equation, sphere, np.tile(u0, (sphere.num_vertices, 1)), 1.0, rtol=1e-5, atol=1e-7).u_end
+
+    def rate(t, u):
+        return np.asarray(kinetics(jnp.asarray(u)[None])[0]) - 2 * growth * u
+
+    expected = scipy.integrate.solve_ivp(rate, (0, 1.0), u0, rtol=1e-9, atol=1e-11).y[:, -1]
+    np.testing.assert_allclose(u, np.tile(expected, (sphere.num_vertices, 1)), rtol=1e-3)
 
 
 def evolving_ellipsoid(level):

@@ -233,3 +233,20 @@ def test_stripes_keep_to_circles_of_latitude_or_go_around_the_tube(name):
     cosine = np.abs((slope * along).sum(axis=1)) / (steep * np.linalg.norm(along, axis=1) + 1e-30)
     off = np.degrees(np.arcsin(np.clip(cosine, 0, 1)))
     assert np.average(off[where], weights=steep[where]) < 10
+
+
+@pytest.mark.slow
+def test_a_pattern_on_a_growing_surface_keeps_its_size_and_gains_spots():
+    mesh = ltl.shapes.icosphere(3)
+    start = ltl.Surface.from_mesh(mesh)
+    kinetics = ltl.kinetics.schnakenberg(rate=40.0)
+    growth, end = 0.25, 3.0
+    equation = ltl.Moving(ltl.ReactionDiffusion((1.0, 10.0), kinetics), lambda t, x: jnp.exp(growth * t) * x)
+    u0 = np.asarray(kinetics.steady_state()) + 0.1 * np.random.default_rng(0).normal(size=(mesh.num_vertices, 2))
+    us = ltl.solve(equation, start, u0, end, (1.0, end), rtol=1e-3, atol=1e-4).us
+    lengths, counts = [], []
+    for t, u in zip((1.0, end), us, strict=True):
+        lengths.append(wavelength(equation.surface_at(jnp.array(t), start), u[:, 0]))
+        counts.append(count_maxima(mesh, np.asarray(u[:, 0])))
+    assert lengths[1] == pytest.approx(lengths[0], rel=0.2)
+    assert counts[1] >= 2 * counts[0] >= 8

@@ -6,16 +6,12 @@ whose ``resolved`` table holds every value, defaults too.
 
 import functools
 import inspect
-import io
-import json
 import math
-import zipfile
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-from xml.parsers import expat
 
 import diffrax
 import equinox as eqx
@@ -30,6 +26,7 @@ from ..operators import curvature
 from ..output.colors import COLORMAPS
 from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface
+from .inputs import arrays, check_self_contained
 from .observed import wanted
 from .paper import parse_condition
 from .reader import ScenarioError, Table, listed, load
@@ -176,7 +173,7 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
         scale = table.choice("scale", ("unit", "keep"), "unit")
         table.finish()
         try:
-            _check_self_contained(path)
+            check_self_contained(path)
             mesh = load_mesh(path, repair=repair).reordered()
         except MeshError as error:
             raise table.refused("file", error) from None
@@ -197,28 +194,6 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
             arguments[key] = table.number(key, float(parameter.default), 1e-3, 1e3)
     table.finish()
     return make(**arguments), None, ()
-
-
-def _check_self_contained(path: Path) -> None:
-    """Raise where a mesh file names others: it could name any, and a copy of it would lack them."""
-    named: list[Any] = []
-    try:
-        if path.suffix.lower() == ".gii":
-            parser = expat.ParserCreate()
-            parser.StartElementHandler = lambda _, values: named.append(values.get("ExternalFileName"))
-            parser.Parse(path.read_bytes(), True)
-        elif path.suffix.lower() in (".gltf", ".glb"):
-            data = path.read_bytes()
-            text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
-            named += [buffer.get("uri") for buffer in json.loads(text)["buffers"]]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, expat.ExpatError):
-        pass  # damaged: reading it says how
-    for other in named:
-        if other and not str(other).startswith("data:"):
-            raise MeshError(
-                f"{path.name}: expected a file that holds all of its data, found one that refers to "
-                f"{str(other)[:60]!r}. Export it in one file, such as GLB, OBJ or PLY."
-            )
 
 
 def _places(table: Table, mesh: Mesh, seed: int) -> Callable[[Formula, str], np.ndarray]:
@@ -453,7 +428,7 @@ def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Pa
     path = table.file("file", folder)
     table.finish()
     try:
-        columns = _arrays(path, species, mesh.num_vertices)
+        columns = arrays(path, species, mesh.num_vertices)
     except Exception as error:  # damaged archives raise anything; here all mean the same
         reason = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
         raise table.error("file", f"an .npz file with arrays {listed(species)} ({reason})") from None
@@ -463,27 +438,6 @@ def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Pa
             raise table.error("file", f"finite values for {s}")
     state[mesh.source_order] = np.stack(columns, axis=1)
     return state, path
-
-
-def _arrays(path: Path, names: tuple[str, ...], size: int) -> list[np.ndarray]:
-    """The arrays (V,) of an .npz file, which is told by its head what it holds before that is unpacked.
-
-    Source: numpy.lib.format.
-    """
-    columns = []
-    # Of sixteen bytes an entry at most, and a head.
-    longest = 16 * size + 4096
-    with zipfile.ZipFile(path) as archive:
-        for name in names:
-            with archive.open(f"{name}.npy") as file:
-                data = io.BytesIO(file.read(longest))
-            version = np.lib.format.read_magic(data)
-            read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            shape, _, dtype = read[version](data)
-            if shape != (size,) or dtype.kind not in "fiu":
-                raise ValueError(f"expected numbers of shape ({size},) for {name}, found {dtype} of shape {shape}")
-            columns.append(np.frombuffer(data.read(size * dtype.itemsize), dtype, size).astype(np.float64))
-    return columns
 
 
 def _settings(root: Table, species: tuple[str, ...]) -> Settings:
