@@ -248,7 +248,7 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     files.write_ply(out / f"{name}.ply", vertices, faces, shades)
     files.write_glb(out / f"{name}.glb", vertices, faces, shades, normals[order])
     written = [f"{name}.html", f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply", f"{name}.glb"]
-    if settings.displacement:
+    if settings.displacement and np.isfinite(last).all():
         moved = texture.displaced(vertices, normals[order], last, settings.displacement)
         files.write_glb(out / f"{name}-displaced.glb", moved, faces, shades)
         written.append(f"{name}-displaced.glb")
