@@ -310,14 +310,29 @@ def test_a_dense_solution_is_known_at_every_time(sphere):
         ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
 
 
+def field_diffusion(field):
+    return ltl.ReactionDiffusion((field,), lambda species, _: (0 * species[0],))
+
+
 WRONG = {
     "negative diffusivity": (dict(equation=ltl.Diffusion(-1.0)), "not negative, found -1"),
+    "a diffusivity of a species that is negative": (
+        dict(equation=ltl.Diffusion(jnp.array([1.0, -2.0])), u0=jnp.ones((162, 2))),
+        "found -2 at species 1",
+    ),
+    "a diffusivity that is negative somewhere": (
+        dict(equation=field_diffusion(jnp.ones(162).at[7:9].set(-0.5)), u0=jnp.ones((162, 1))),
+        r"found -0\.5 at vertex 7 in the equation's\.diffusivity\[0\]",
+    ),
     "an equation that is not finite": (dict(equation=ltl.Diffusion(float("inf"))), "diffusivity is not finite"),
     "a state of another length": (dict(u0=jnp.ones(5)), r"found \(5,\)"),
     "a source of another shape": (dict(equation=ltl.Diffusion(source=jnp.ones(5))), r"found \(5,\)"),
     "times out of order": (dict(ts=[0.5, 0.2]), r"ts\[1\] = 0.2 after 0.5"),
     "times beyond the end": (dict(ts=[0.5, 2.0]), r"found ts\[1\] = 2.0"),
     "an end before the start": (dict(t0=3.0), "t0 = 3.0 and t1 = 1.0"),
+    "no times": (dict(ts=[]), "at least one time"),
+    "a relative tolerance of zero": (dict(rtol=0.0), "found rtol = 0.0"),
+    "a negative absolute tolerance": (dict(atol=-1e-6), "found atol = -1e-06"),
     "a step that is not positive": (dict(dt=0.0), "dt = 0.0"),
     "an explicit step too long": (dict(dt=0.5, solver=diffrax.Tsit5()), "too long for Tsit5"),
     "SBDF2 without steps": (dict(solver=ltl.SBDF2()), "SBDF2 takes fixed steps"),
@@ -364,3 +379,30 @@ def test_long_stiff_runs_take_implicit_steps_by_themselves(sphere):
     assert found.method.startswith("RKL2: explicit")
     traced = jax.jit(lambda d: ltl.solve(ltl.Diffusion(d), sphere, sphere.vertices[:, 0], 1.0, max_steps=10))
     assert traced(1e4).method.startswith("RKL2")
+
+
+def test_the_length_of_a_run_needs_no_compiling(sphere):
+    traced = []
+
+    def source(t, x):
+        traced.append(t)
+        return x[:, 0]
+
+    equation = ltl.Diffusion(1e4, source=source)
+    said = []
+    for t1 in (1.0, 2.0):
+        solution = ltl.solve(equation, sphere, sphere.vertices[:, 0], t1)
+        said.append((solution.method, len(traced)))
+    assert said[0][0].startswith("TRBDF2: implicit")
+    assert said[0][0] != said[1][0]
+    # Once more where it is looked at before the run, outside of jit.
+    assert said[1][1] - said[0][1] <= 1
+
+
+def test_a_fixed_step_that_is_unstable_is_said_first(sphere):
+    # Stable at the first state, and too long for what the reaction becomes.
+    stiffening = ltl.ReactionDiffusion((0.1,), lambda species, _: (1000 - species[0] ** 3,))
+    with pytest.raises(
+        ltl.SolveError, match=r"overflowed.* Causes are \(a\) a dt beyond what the solver is stable for"
+    ):
+        ltl.solve(stiffening, sphere, 0 * sphere.vertices[:, :1], 1.0, solver=diffrax.Heun(), dt=0.02)
