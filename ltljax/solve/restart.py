@@ -223,7 +223,7 @@ class Keeper:
     @staticmethod
     def _load(path: Path, name: str) -> np.ndarray:
         try:
-            with np.load(path, allow_pickle=False) as found:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as found:
                 return found[name]
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise RestartError(f"{path} is missing or damaged. Start the run anew without resume.") from error
