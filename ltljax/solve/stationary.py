@@ -60,8 +60,9 @@ def poisson(
     more than discretisation makes of none (``4 pi`` over the number of vertices, of the size of f, or a hundredth), and
     the u whose mean (in the vertex areas) is zero is returned.
 
-    By Krylov iteration preconditioned by multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many
-    more iterations), and differentiable in f, the data of the conditions and, with a ``preconditioner``, the vertices.
+    By Krylov iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by
+    multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many more iterations), and differentiable in
+    f, the data of the conditions and, with a ``preconditioner``, the vertices.
 
     Args:
         surface: the surface.
@@ -185,7 +186,10 @@ def _stationary(
     flat = diffusivities.reshape(-1) if trailing else diffusivities[None]
     alpha = jnp.broadcast_to(jnp.mean(screening), flat.shape)
     inverse = Preconditioning(multigrid).of(surface, alpha, flat)
-    found = linear_solve(apply, right, inverse, tolerance, 200 if multigrid is not None else 20_000)
+    # Of high order the operator may be far from the one that preconditions it.
+    persists = not isinstance(surface.scheme, Monotone)
+    most = 200 if multigrid is not None else 20_000
+    found = linear_solve(apply, right, inverse, tolerance, most, persists=persists)
     constants = means(found.value)
     u = start + found.value - jnp.where(
         is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
@@ -195,7 +199,13 @@ def _stationary(
     rounding = (1e3 * jnp.finfo(start.dtype).eps + tolerance) / _INCOMPATIBLE
     number = _over_components(surface, jnp.ones_like(surface.vertex_areas)).reshape(-1, *trailing)
     size = jnp.sqrt(_over_components(surface, load**2) / number) + rounding * jnp.sqrt(jnp.mean(value**2))
-    return u, constants * scale * diffusivities[None], size, found.result == lx.RESULTS.successful, found.stats["num_steps"]
+    return (
+        u,
+        constants * scale * diffusivities[None],
+        size,
+        found.result == lx.RESULTS.successful,
+        found.stats["num_steps"],
+    )
 
 
 def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum) -> Array:
