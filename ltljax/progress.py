@@ -31,9 +31,14 @@ def _plain(steps: Sequence[Any], what: str) -> Iterator[Any]:
     start = time.perf_counter()
     for done, step in enumerate(steps):
         if done and done % max(1, len(steps) // 10) == 0:
-            left = (time.perf_counter() - start) / done * (len(steps) - done)
-            print(f"{what}: {100 * done // len(steps)} %, about {left:.0f} s left", file=sys.stderr)
+            say(what, done / len(steps), start)
         yield step
+
+
+def say(what: str, share: float, start: float) -> None:
+    """Print how much of a work is done, and how long the rest will take if it goes on as since the start."""
+    left = (time.perf_counter() - start) * (1 - share) / max(share, 1e-9)
+    print(f"{what}: {100 * share:.0f} %, about {left:.0f} s left", file=sys.stderr)
 
 
 class Laps:

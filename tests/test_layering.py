@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "elliptic": {"surface", "lifting", "mesh", "tables", "progress"},
     "formulas": set(),
     "equations": {"elliptic", "operators", "surface", "tables"},
-    "solve": {"equations", "operators", "surface", "tables", "lifting", "mesh"},
+    "solve": {"elliptic", "equations", "operators", "surface", "tables", "lifting", "mesh", "progress"},
     "fit": {"equations", "operators", "surface", "tables", "solve", "progress", "output"},
     "output": set(),
     "show": {"mesh", "surface", "solve", "tables", "output"},

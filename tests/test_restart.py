@@ -26,44 +26,54 @@ surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
 x = surface.vertices
 u0 = jax.numpy.stack([1 - 0.5 * jax.numpy.exp(-4 * x[:, 0] ** 2), 0.5 * jax.numpy.exp(-4 * x[:, 0] ** 2)], axis=1)
 equation = ltl.ReactionDiffusion((0.02, 0.01), ltl.kinetics.gray_scott())
-print("begun", flush=True)
 solution = ltl.solve(
-    equation, surface, u0, 20.0, dt=0.01, checkpoint_dir=sys.argv[1], checkpoint_every=0.2, resume=True
+    equation, surface, u0, float(sys.argv[3]), dt=0.01, checkpoint_dir=sys.argv[1], checkpoint_every=0.1, resume=True
 )
 np.save(sys.argv[2], solution.u_end)
 """
 
 
-def run(folder, end, kill_after=None):
-    """One process of the run, killed so many seconds after it has begun if it lasts that long."""
-    command = [sys.executable, "-c", RUN, folder, end]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        if kill_after is not None:
-            process.stdout.readline()
-            time.sleep(kill_after)
-            process.send_signal(signal.SIGKILL)
-        return process.wait()
+def latest(folder):
+    """The number of the last state in a folder; -1 where there is none."""
+    return max((int(path.stem.removeprefix("state_")) for path in folder.glob("state_*.npz")), default=-1)
 
 
-def killed_and_resumed(tmp_path, kills):
-    """The end of a run that was not interrupted, and of one that was killed that many times."""
-    whole, pieces = tmp_path / "whole.npy", tmp_path / "pieces.npy"
-    assert run(tmp_path / "a", whole) == 0
+def start(folder, end, intervals):
+    command = [sys.executable, "-c", RUN, str(folder), str(end), str(0.1 * intervals)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def killed_and_resumed(tmp_path, kills, intervals):
+    """The end of a run that was not interrupted, and of one that was killed that many times on its way."""
+    whole, pieces, folder = tmp_path / "whole.npy", tmp_path / "pieces.npy", tmp_path / "b"
+    ends = [start(tmp_path / "a", whole, intervals)]
     chance = random.Random(0)
     for _ in range(kills):
-        run(tmp_path / "b", pieces, kill_after=chance.uniform(0.0, 4.0))
-    assert run(tmp_path / "b", pieces) == 0
+        begun = latest(folder)
+        until = begun + chance.randint(1, intervals // (2 * kills))
+        process = start(folder, pieces, intervals)
+        while latest(folder) < until and process.poll() is None:
+            time.sleep(1e-3)
+        time.sleep(chance.uniform(0.0, 0.02))  # anywhere in what an interval does
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        assert begun < latest(folder) < intervals - 1
+    ends.append(start(folder, pieces, intervals))
+    for process in ends:
+        said = process.communicate()[1]
+        assert process.returncode == 0, said
     return np.load(whole), np.load(pieces)
 
 
 def test_a_killed_run_goes_on_to_the_same_bits(tmp_path):
-    whole, pieces = killed_and_resumed(tmp_path, 2)
+    whole, pieces = killed_and_resumed(tmp_path, 2, 80)
     assert np.array_equal(whole, pieces)
 
 
 @pytest.mark.slow
 def test_a_run_killed_twenty_times_goes_on_to_the_same_bits(tmp_path):
-    whole, pieces = killed_and_resumed(tmp_path, 20)
+    whole, pieces = killed_and_resumed(tmp_path, 20, 2000)
     assert np.array_equal(whole, pieces)
 
 
@@ -102,16 +112,22 @@ def test_files_of_another_run_are_refused(case, tmp_path):
 
 def test_damaged_files_are_refused_and_unfinished_ones_not_read(case, tmp_path):
     equation, surface, u0 = case
-    ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path)
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, ts=[0.2, 1.0], checkpoint_dir=tmp_path)
+    whole = run()
     (tmp_path / "state_000020.unfinished").write_bytes(b"half")
-    ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path, resume=True)
-    state = tmp_path / "state_000003.npy"
-    state.write_bytes(state.read_bytes()[:50])
-    with pytest.raises(ltl.RestartError, match=r"state_000003\.npy is missing or damaged"):
-        ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path, resume=True)
-    (tmp_path / "progress.json").write_text("{")
-    with pytest.raises(ltl.RestartError, match=r"progress.json is damaged"):
-        ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path, resume=True)
+    np.testing.assert_array_equal(run(resume=True).us, whole.us)
+    asked = tmp_path / "state_000003.npz"
+    content = asked.read_bytes()
+    for damaged in (content[:50], content[: len(content) // 2] + b"x" * 30 + content[len(content) // 2 + 30 :]):
+        asked.write_bytes(damaged)
+        with pytest.raises(ltl.RestartError, match=r"state_000003\.npz is missing or damaged"):
+            run(resume=True)
+    asked.unlink()
+    with pytest.raises(ltl.RestartError, match=r"state at t = 0\.2 is missing"):
+        run(resume=True)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(ltl.RestartError, match=r"run\.json is damaged"):
+        run(resume=True)
 
 
 def test_starting_anew_leaves_other_files_alone(case, tmp_path):
@@ -120,7 +136,21 @@ def test_starting_anew_leaves_other_files_alone(case, tmp_path):
     ltl.solve(equation, surface, u0, 0.5, checkpoint_dir=tmp_path)
     ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path)
     assert (tmp_path / "notes.txt").read_text() == "mine"
-    assert len(os.listdir(tmp_path)) == 22  # twenty states, the progress, the notes
+
+
+def test_the_folder_holds_the_last_states_and_those_asked_for(case, tmp_path):
+    equation, surface, u0 = case
+    ltl.solve(equation, surface, u0, 1.0, ts=[0.25, 0.5], checkpoint_dir=tmp_path, checkpoint_every=0.01)
+    states = sorted(os.listdir(tmp_path))
+    assert states == ["run.json", *(f"state_{number:06d}.npz" for number in (24, 49, 98, 99))]
+
+
+@pytest.mark.parametrize("how", [dict(dt=0.05), dict()], ids=["fixed", "adaptive"])
+def test_no_interval_is_of_rounding(case, tmp_path, how):
+    equation, surface, u0 = case
+    # A tenth three times is not three tenths.
+    ltl.solve(equation, surface, u0, 0.9, ts=[0.3, 0.6, 0.9], checkpoint_dir=tmp_path, checkpoint_every=0.1, **how)
+    assert sorted(os.listdir(tmp_path))[-1] == "state_000008.npz"
 
 
 def test_a_fingerprint_is_of_what_a_value_is():
@@ -162,6 +192,61 @@ def test_a_fingerprint_is_of_what_a_function_reads(monkeypatch):
     assert fingerprint(functools.partial(max, 1.0)) != fingerprint(functools.partial(max, 2.0))
     assert fingerprint(lambda x: np.sin(x)) != fingerprint(lambda x: np.cos(x))
     assert fingerprint(ltl.RKL2()) != fingerprint(ltl.RKL1())
+
+
+class Opaque:
+    def __init__(self, rate):
+        self.rate = rate
+
+    def __call__(self, x):
+        return self.rate * x
+
+
+TABLE = {"rate": [1.0, 2.0]}
+
+
+def makes_a_function(x):
+    def within(x):
+        return RATE * x + TABLE["rate"][0]
+
+    return within(x)
+
+
+def tells_apart(x):
+    return x in {"spots", "stripes", "holes", "waves"}
+
+
+PRINT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import test_restart as here
+from ltljax.solve.restart import fingerprint
+print(fingerprint([here.tells_apart, here.Opaque(1.0), here.makes_a_function, here.ltl.RKL2(), here.np.float32]))
+"""
+
+
+def test_a_fingerprint_is_the_same_in_every_process():
+    command = [sys.executable, "-c", PRINT, os.path.dirname(__file__)]
+    processes = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONHASHSEED": seed})
+        for seed in ("1", "2")
+    ]
+    one, other = (process.communicate()[0] for process in processes)
+    assert [process.returncode for process in processes] == [0, 0]
+    assert one == other
+
+
+def test_a_fingerprint_sees_objects_and_what_functions_within_read(monkeypatch):
+    assert fingerprint(Opaque(1.0)) == fingerprint(Opaque(1.0))
+    assert fingerprint(Opaque(1.0)) != fingerprint(Opaque(2.0))
+    assert fingerprint((12, 3)) != fingerprint((1, 23))
+    assert fingerprint({1, 2}) != fingerprint({1, 3})
+    before = fingerprint(makes_a_function)
+    monkeypatch.setitem(globals(), "RATE", 2.0)
+    after = fingerprint(makes_a_function)
+    assert before != after
+    monkeypatch.setitem(globals(), "TABLE", {"rate": [5.0, 2.0]})
+    assert after != fingerprint(makes_a_function)
 
 
 def test_a_run_of_no_length_is_kept_too(case, tmp_path):

@@ -1,5 +1,7 @@
 """Time stepping: against exact solutions, against itself at half the step, and through its derivatives."""
 
+import re
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -145,6 +147,38 @@ def test_an_overflow_is_raised_with_its_time_and_its_causes(sphere):
     assert abs(caught.value.time - np.pi / 2) < 0.01
     silent = ltl.solve(equation, sphere, u0, 5.0, throw=False)
     assert bool(silent.overflowed)
+
+
+def test_a_large_state_is_no_overflow(sphere):
+    x1 = sphere.vertices[:, 0]
+    large = ltl.solve(ltl.Diffusion(source=1e8 * x1), sphere, 0 * x1, 5.0).u_end
+    np.testing.assert_allclose(large, 1e8 * (1 - np.exp(-10)) * x1 / 2, rtol=0.02, atol=1e4)
+    growing = ltl.ReactionDiffusion((1.0,), lambda species, _: (20 * species[0],))
+    grown = ltl.solve(growing, sphere, jnp.ones((sphere.num_vertices, 1)), 1.0, rtol=1e-6).u_end
+    np.testing.assert_allclose(grown, np.exp(20), rtol=1e-2)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5(), ltl.TRBDF2()], ids=["default", "Tsit5", "TRBDF2"])
+def test_a_state_without_end_ends_within_few_steps(dtype, solver):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), dtype=dtype)
+    explosive = ltl.ReactionDiffusion((0.1,), lambda species, p: (species[0] ** 3 + p,), params=jnp.ones((), dtype))
+    u0 = jnp.zeros((surface.num_vertices, 1), dtype)
+    found = ltl.solve(explosive, surface, u0, 5.0, solver=solver, throw=False)
+    assert bool(found.overflowed)
+    assert found.t_end == pytest.approx(2 * np.pi / 3**1.5, rel=0.01)
+    assert found.counts["num_steps"] < 2000
+
+
+def test_without_tqdm_the_remaining_time_is_printed(sphere, monkeypatch, capfd):
+    def absent():
+        raise ImportError
+
+    monkeypatch.setattr(diffrax, "TqdmProgressMeter", absent)
+    ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 1.0, dt=0.01, solver=ltl.RKL2(), progress=True)
+    said = capfd.readouterr().err
+    assert re.search(r"time: 5\d %, about \d+ s left", said)
+    assert "time: 100 %, about 0 s left" in said
 
 
 def test_a_nan_at_the_start_stops_at_once(sphere):

@@ -60,39 +60,58 @@ def test_fixed_steps_have_the_order_of_the_method(sphere, decay, name):
     assert errors[-1] < 0.1**order
 
 
-@pytest.mark.parametrize("name", ["TRBDF2", "SBDF2", pytest.param("KenCarp3", marks=pytest.mark.slow), "RKL2"])
-def test_the_order_holds_with_a_source_in_time_and_a_reaction(sphere, name):
-    solver, order, counts = SOLVERS[name]
+def oscillator(species, params):
+    u, v = species
+    return -2.0 * v - u**3, 2.0 * u - params * v
+
+
+@pytest.fixture(scope="module")
+def forced(sphere):
+    """A reaction, and a diffusion with a source in time, with their states at t = 1 by a method of eighth order."""
     x = sphere.vertices
-
-    def oscillator(species, params):
-        u, v = species
-        return -2.0 * v - u**3, 2.0 * u - params * v
-
-    equation = ltl.ReactionDiffusion((0.05, 0.02), oscillator, params=jnp.array(0.3))
-    u0 = jnp.stack([1 + x[:, 0], x[:, 1]], axis=1)
-    run = lambda solver, **how: ltl.solve(equation, sphere, u0, 1.0, solver=solver, **how).us[-1]  # noqa: E731
-    exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
-    counts = (64, 256)
-    errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
-    assert abs(slopes(errors, counts)[0] - order) < 0.2
-    source = ltl.Diffusion(0.05, source=lambda t, x: jnp.cos(5 * t) * x[:, 0])
-    run = lambda solver, **how: ltl.solve(source, sphere, 0 * x[:, 0], 1.0, solver=solver, **how).us[-1]  # noqa: E731
-    exact = run(diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
-    errors = [float(jnp.linalg.norm(run(solver, dt=1 / n, rtol=1e-11, atol=1e-12) - exact)) for n in counts]
-    assert abs(slopes(errors, counts)[0] - order) < 0.2
+    reacting = ltl.ReactionDiffusion((0.05, 0.02), oscillator, params=jnp.array(0.3))
+    driven = ltl.Diffusion(0.05, source=lambda t, x: jnp.cos(5 * t) * x[:, 0])
+    cases = []
+    for equation, u0 in ((reacting, jnp.stack([1 + x[:, 0], x[:, 1]], axis=1)), (driven, 0 * x[:, 0])):
+        end = ltl.solve(equation, sphere, u0, 1.0, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13).u_end
+        cases.append((equation, u0, end))
+    return cases
 
 
-@pytest.mark.parametrize("name", ["BackwardEuler", "TRBDF2", "Kvaerno3", "SBDF2", "KenCarp3"])
+# Fewest and most steps, of the reaction and of the source, where errors follow the order and stand out from rounding.
+FORCED = {
+    "SBDF2": ((32, 96), (32, 96)), "RKL2": ((32, 96), (32, 96)), "Sil3": ((48, 144), (48, 144)),
+    "KenCarp3": ((64, 256), (64, 256)), "KenCarp4": ((8, 24), (8, 24)), "KenCarp5": ((64, 128), (8, 24)),
+    "Kvaerno5": ((48, 96), (12, 24)),
+}  # fmt: skip
+QUICK = ["TRBDF2", "SBDF2", "KenCarp4", "RKL2"]
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in SOLVERS]
+)
+def test_the_order_holds_with_a_source_in_time_and_a_reaction(sphere, forced, name):
+    solver, order, _ = SOLVERS[name]
+    for (equation, u0, exact), counts in zip(forced, FORCED.get(name, 2 * ((16, 48),)), strict=True):
+        errors = []
+        for count in counts:
+            how = dict(solver=solver, dt=1 / count, rtol=1e-12, atol=1e-13)
+            errors.append(float(jnp.linalg.norm(ltl.solve(equation, sphere, u0, 1.0, **how).u_end - exact)))
+        assert abs(slopes(errors, counts)[0] - order) < 0.2
+        assert errors[-1] < 0.1 * jnp.linalg.norm(exact)
+
+
+L_STABLE = ["BackwardEuler", "TRBDF2", "SBDF2", "Kvaerno3", "Kvaerno5", "KenCarp3", "KenCarp4", "KenCarp5"]
+
+
+@pytest.mark.parametrize("name", [*L_STABLE, "CrankNicolson"])
 def test_l_stable_solvers_forget_what_is_stiff(sphere, name):
     rough = jnp.asarray(np.random.default_rng(0).normal(size=sphere.num_vertices))
-    stiff = ltl.Diffusion(1e5)
     mean = ltl.integrate(sphere, rough, sphere.mass) / jnp.sum(sphere.mass)
-    end = ltl.solve(stiff, sphere, rough, 1.0, solver=SOLVERS[name][0], dt=0.1, rtol=1e-10, atol=1e-12).us[-1]
-    assert jnp.max(jnp.abs(end - mean)) < 1e-6
+    how = dict(solver=SOLVERS[name][0], dt=0.1, rtol=1e-10, atol=1e-12)
+    end = ltl.solve(ltl.Diffusion(1e5), sphere, rough, 1.0, **how).us[-1]
     # And Crank-Nicolson does not.
-    end = ltl.solve(stiff, sphere, rough, 1.0, solver=ltl.CrankNicolson(), dt=0.1, rtol=1e-10, atol=1e-12).us[-1]
-    assert jnp.max(jnp.abs(end - mean)) > 0.1
+    assert (jnp.max(jnp.abs(end - mean)) < 1e-6) == (name in L_STABLE)
 
 
 @pytest.mark.parametrize("solver", [ltl.RKL1(), ltl.BackwardEuler()], ids=["RKL1", "BackwardEuler"])
@@ -185,7 +204,7 @@ def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name
     def loss(parameters):
         kinetics = ltl.kinetics.gray_scott(parameters["feed"], 0.06)
         equation = ltl.ReactionDiffusion((parameters["diffusivity"], 0.01), kinetics)
-        moved = sphere.with_vertices(x * (1 + parameters["shape"] * x[:, :1]))
+        moved = sphere.with_vertices(x + parameters["vertices"])
         start = u0 * (1 + parameters["start"][:, None])
         how_exactly = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
         end = ltl.solve(equation, moved, start, 1.0, solver=solver, **how_exactly).us[-1]
@@ -193,13 +212,14 @@ def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name
 
     random = np.random.default_rng(0)
     at = dict(
-        diffusivity=jnp.array(0.1), feed=jnp.array(0.04), shape=jnp.array(0.1),
+        diffusivity=jnp.array(0.1), feed=jnp.array(0.04), vertices=0.1 * x[:, :1] * x,
         start=jnp.asarray(0.1 * random.normal(size=sphere.num_vertices)),
     )  # fmt: skip
     value, gradient = jax.jit(jax.value_and_grad(loss))(at)
     loss = jax.jit(loss)
     directions = dict(
-        diffusivity=0.1, feed=0.03, shape=0.1, start=0.2 * random.normal(size=sphere.num_vertices)
+        diffusivity=0.1, feed=0.03, start=0.2 * random.normal(size=sphere.num_vertices),
+        vertices=0.1 * random.normal(size=x.shape),
     )  # fmt: skip
     for key, direction in directions.items():
         slope = jnp.sum(gradient[key] * direction)
@@ -216,14 +236,14 @@ def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name
 
     @jax.jit
     def loss(parameters):
-        # A logistic reaction, its rate a field, with values held on one side and a flux through the other.
+        # A logistic reaction, its rate a field, with a source, values held on one side and a flux through the other.
         conditions = (
             ltl.Neumann(parameters["flux"] * jnp.sin(x[:, 1])),
             ltl.Dirichlet(parameters["values"], where=lambda x: x[:, 0] > 0.2),
         )
         equation = ltl.ReactionDiffusion(
-            (0.1,), lambda species, rate: (rate * species[0] * (1 - species[0]),),
-            params=parameters["rate"], boundary=conditions,
+            (0.1,), lambda species, p: (p["rate"] * species[0] * (1 - species[0]) + p["source"],),
+            params=dict(rate=parameters["rate"], source=parameters["source"]), boundary=conditions,
         )  # fmt: skip
         how_exactly = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
         end = ltl.solve(equation, surface, 0.2 + 0 * x[:, :1], 1.0, solver=solver, **how_exactly).us[-1]
@@ -231,13 +251,28 @@ def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name
 
     random = np.random.default_rng(0)
     field = jnp.asarray(random.uniform(size=surface.num_vertices))
-    at = dict(values=0.3 + field, flux=jnp.array(0.5), rate=1 + field)
+    at = dict(values=0.3 + field, flux=jnp.array(0.5), rate=1 + field, source=0.2 * field)
     value, gradient = jax.jit(jax.value_and_grad(loss))(at)
-    for key, direction in dict(values=0.5 * field, flux=jnp.array(0.5), rate=field).items():
+    for key, direction in dict(values=0.5 * field, flux=jnp.array(0.5), rate=field, source=field).items():
         slope = jnp.sum(gradient[key] * direction)
         assert abs(slope) > 1e-3
         rest = [abs(loss({**at, key: at[key] + h * direction}) - value - h * slope) for h in (0.1, 0.01)]
         assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_the_direct_adjoint_has_the_derivatives_of_checkpoints(sphere, name):
+    solver, how = GRADIENTS[name]
+    x1 = sphere.vertices[:, 0]
+
+    def end(rate, adjoint):
+        equation = ltl.ReactionDiffusion((0.2,), lambda species, p: (p * species[0] - species[0] ** 2,), params=rate)
+        how_exactly = dict(rtol=1e-11, atol=1e-12, throw=False, max_steps=100, adjoint=adjoint, **how)
+        return jnp.sum(ltl.solve(equation, sphere, 1 + x1[:, None], 1.0, solver=solver, **how_exactly).us[-1] ** 2)
+
+    checkpointed = jax.grad(end)(jnp.array(1.5), None)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(end)(jnp.array(1.5), diffrax.DirectAdjoint()), checkpointed, rtol=1e-7)
 
 
 def test_a_source_field_is_differentiated_in_forward_and_reverse(sphere):
@@ -310,14 +345,29 @@ def test_a_dense_solution_is_known_at_every_time(sphere):
         ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
 
 
+def field_diffusion(field):
+    return ltl.ReactionDiffusion((field,), lambda species, _: (0 * species[0],))
+
+
 WRONG = {
     "negative diffusivity": (dict(equation=ltl.Diffusion(-1.0)), "not negative, found -1"),
+    "a diffusivity of a species that is negative": (
+        dict(equation=ltl.Diffusion(jnp.array([1.0, -2.0])), u0=jnp.ones((162, 2))),
+        "found -2 at species 1",
+    ),
+    "a diffusivity that is negative somewhere": (
+        dict(equation=field_diffusion(jnp.ones(162).at[7:9].set(-0.5)), u0=jnp.ones((162, 1))),
+        r"found -0\.5 at vertex 7 in the equation's\.diffusivity\[0\]",
+    ),
     "an equation that is not finite": (dict(equation=ltl.Diffusion(float("inf"))), "diffusivity is not finite"),
     "a state of another length": (dict(u0=jnp.ones(5)), r"found \(5,\)"),
     "a source of another shape": (dict(equation=ltl.Diffusion(source=jnp.ones(5))), r"found \(5,\)"),
     "times out of order": (dict(ts=[0.5, 0.2]), r"ts\[1\] = 0.2 after 0.5"),
     "times beyond the end": (dict(ts=[0.5, 2.0]), r"found ts\[1\] = 2.0"),
     "an end before the start": (dict(t0=3.0), "t0 = 3.0 and t1 = 1.0"),
+    "no times": (dict(ts=[]), "at least one time"),
+    "a relative tolerance of zero": (dict(rtol=0.0), "found rtol = 0.0"),
+    "a negative absolute tolerance": (dict(atol=-1e-6), "found atol = -1e-06"),
     "a step that is not positive": (dict(dt=0.0), "dt = 0.0"),
     "an explicit step too long": (dict(dt=0.5, solver=diffrax.Tsit5()), "too long for Tsit5"),
     "SBDF2 without steps": (dict(solver=ltl.SBDF2()), "SBDF2 takes fixed steps"),
@@ -357,6 +407,9 @@ def test_long_stiff_runs_take_implicit_steps_by_themselves(sphere):
 
     assert chosen(1.0).startswith("RKL2: explicit")
     assert chosen(1e4).startswith("TRBDF2: implicit")
+    # What is stiff depends on how long steps may be otherwise.
+    assert chosen(300.0, rtol=1e-3).startswith("TRBDF2: implicit")
+    assert chosen(300.0, rtol=1e-6).startswith("RKL2: explicit")
     assert chosen(1e4, solver=ltl.RKL2()).startswith("RKL2: chosen by the caller")
     # A reaction may be stiff itself, which implicit steps are bad at.
     reacting = ltl.ReactionDiffusion((1e4,), lambda species, _: (-species[0],))
@@ -364,3 +417,30 @@ def test_long_stiff_runs_take_implicit_steps_by_themselves(sphere):
     assert found.method.startswith("RKL2: explicit")
     traced = jax.jit(lambda d: ltl.solve(ltl.Diffusion(d), sphere, sphere.vertices[:, 0], 1.0, max_steps=10))
     assert traced(1e4).method.startswith("RKL2")
+
+
+def test_the_length_of_a_run_needs_no_compiling(sphere):
+    traced = []
+
+    def source(t, x):
+        traced.append(t)
+        return x[:, 0]
+
+    equation = ltl.Diffusion(1e4, source=source)
+    said = []
+    for t1 in (1.0, 2.0):
+        solution = ltl.solve(equation, sphere, sphere.vertices[:, 0], t1)
+        said.append((solution.method, len(traced)))
+    assert said[0][0].startswith("TRBDF2: implicit")
+    assert said[0][0] != said[1][0]
+    # Once more where it is looked at before the run, outside of jit.
+    assert said[1][1] - said[0][1] <= 1
+
+
+def test_a_fixed_step_that_is_unstable_is_said_first(sphere):
+    # Stable at the first state, and too long for what the reaction becomes.
+    stiffening = ltl.ReactionDiffusion((0.1,), lambda species, _: (1000 - species[0] ** 3,))
+    with pytest.raises(
+        ltl.SolveError, match=r"overflowed.* Causes are \(a\) a dt beyond what the solver is stable for"
+    ):
+        ltl.solve(stiffening, sphere, 0 * sphere.vertices[:, :1], 1.0, solver=diffrax.Heun(), dt=0.02)

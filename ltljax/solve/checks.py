@@ -7,6 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
+from ..elliptic import EllipticStencil
 from ..equations import Equation
 from ..surface import Surface
 from ..tables import AnyArray
@@ -35,6 +36,8 @@ def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
         raise ValueError(f"Expected t1 at or after t0, found t0 = {start} and t1 = {end}.")
     if asked.ndim != 1:
         raise ValueError(f"Expected ts as a list of times, found an array of shape {asked.shape}.")
+    if not asked.size:
+        raise ValueError("Expected ts to hold at least one time, found none. Leave it out for the state at t1 alone.")
     is_bad = ~((asked >= start) & (asked <= end))
     if is_bad.any():
         first = int(np.flatnonzero(is_bad)[0])
@@ -47,6 +50,16 @@ def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
         )
 
 
+def tolerances(rtol: ArrayLike, atol: ArrayLike) -> None:
+    """Raise where tolerances are not positive."""
+    for name, tolerance in (("rtol", rtol), ("atol", atol)):
+        if not isinstance(tolerance, Tracer) and not (np.isfinite(tolerance) and np.all(np.asarray(tolerance) > 0)):
+            raise ValueError(
+                f"Expected a positive tolerance, found {name} = {tolerance}: steps would have to be without error. For "
+                "steps of a length of your own give dt."
+            )
+
+
 def finite(equation: Equation, u0: Array) -> None:
     """Raise where the initial state or the numbers of an equation are not finite, or a diffusivity is negative."""
     if not isinstance(u0, Tracer):
@@ -54,17 +67,31 @@ def finite(equation: Equation, u0: Array) -> None:
         if is_bad.any():
             at = np.argwhere(is_bad)[0]
             raise ValueError(f"The initial state is {np.asarray(u0)[tuple(at)]} at vertex {at[0]}.")
-        diffusivities = equation.diffusivities(u0)
-        if not isinstance(diffusivities, Tracer) and (np.asarray(diffusivities) < 0).any():
-            raise ValueError(
-                f"Expected diffusivities that are not negative, found {np.asarray(diffusivities)}: diffusion backwards "
-                "in time is not well posed."
-            )
     for path, leaf in jax.tree_util.tree_leaves_with_path(equation):
         if isinstance(leaf, Tracer) or not isinstance(leaf, float | np.ndarray | jax.Array):
             continue
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"The equation's{jax.tree_util.keystr(path)} is not finite.")
+    # Fields too, whose mean is what `diffusivities` says; stencils have signs of their own.
+    for path, leaf in jax.tree_util.tree_leaves_with_path(equation, is_leaf=lambda x: isinstance(x, EllipticStencil)):
+        is_spread = any(getattr(key, "name", None) in ("diffusivity", "mobility") for key in path)
+        if is_spread and isinstance(leaf, float | np.ndarray | jax.Array):
+            _diffuses_forwards(leaf, f" in the equation's{jax.tree_util.keystr(path)}", u0)
+    if not isinstance(u0, Tracer):
+        _diffuses_forwards(equation.diffusivities(u0), "", u0)
+
+
+def _diffuses_forwards(diffusivity: ArrayLike, where: str, u0: Array) -> None:
+    """Raise where a diffusivity, a number or one for each species or vertex, is negative."""
+    if isinstance(diffusivity, Tracer) or not (is_negative := np.asarray(diffusivity) < 0).any():
+        return
+    at = np.argwhere(is_negative)[0]
+    is_field = is_negative.shape[:1] == u0.shape[:1]
+    place = f" at {'vertex' if is_field else 'species'} {at[0]}" if at.size else ""
+    raise ValueError(
+        f"Expected diffusivities that are not negative, found {np.asarray(diffusivity)[tuple(at)]:g}{place}{where}: "
+        "diffusion backwards in time is not well posed. Where nothing diffuses give 0."
+    )
 
 
 def step(

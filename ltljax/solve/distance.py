@@ -30,11 +30,12 @@ def geodesic_distance(
     keeps its relative accuracy where it is tiny, which an iteration does not.
 
     Args:
-        surface: a connected `Monotone` surface.
+        surface: a `Monotone` surface. On a component without a source the distance is infinite.
         sources: indices of vertices.
         time: of the step; by default the square of the mean distance of neighbours.
 
     Raises:
+        SolveError: the potential was not found.
         ValueError: there are no sources, or not on the surface, or the surface is being traced.
 
     Source: Crane, Weischedel and Wardetzky (2013), Geodesics in heat, doi:10.1145/2516971.2516977.
@@ -62,8 +63,13 @@ def geodesic_distance(
     with warnings.catch_warnings():
         # Where the distance has kinks the mean is not that of a divergence.
         warnings.simplefilter("ignore", IncompatibleSourceWarning)
-        distance = poisson(surface, _divergence(surface, descent, is_source), throw=False)
-    return distance - jnp.min(distance[sources])
+        distance = poisson(surface, _divergence(surface, descent, is_source))
+    # A potential is known up to a constant on every component.
+    components = np.asarray(surface.topology.components)
+    nearest = np.full(surface.topology.num_components, -np.inf)
+    for component in np.unique(components[sources]):
+        nearest[component] = np.asarray(distance)[sources[components[sources] == component]].min()
+    return distance - jnp.asarray(nearest[components], surface.dtype)
 
 
 @eqx.filter_jit

@@ -26,15 +26,15 @@ from .implicit import SBDF2, TRBDF2, ImplicitRungeKutta, Preconditioning, withou
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
 from .stabilised import RKL2, differentiable
+from .steps import Advancing, TextMeter, without_twins
 
-# A state that grows this much over its start (or over one) is on its way to overflow.
-_OVERFLOW = 1e6
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
 
-# Linear runs this many times as long as the fastest decay are quicker with implicit steps, see
+# Linear runs are quicker with implicit steps where they are this many times as long as the fastest decay, over the cube
+# root of the tolerance: explicit steps are as long as stability allows, implicit ones as the tolerance does. See
 # benchmarks/time_to_accuracy.md. With a reaction they can be slower by a hundred times, where it is stiff itself.
-_STIFF = 1e5
+_STIFF = 2e3
 
 # Bytes that the checkpoints of a reverse pass may take: with one for every step none is taken a second time, and a
 # gradient costs 3.4 forward runs instead of 5.
@@ -90,7 +90,8 @@ class Solution(eqx.Module):
         u_end: the state there.
         counts: numbers of steps and, with `RKL2` and `RKL1`, of evaluations of the rate.
         result: `diffrax.RESULTS`; an overflow is not a failure of the solver and shows in ``overflowed`` instead.
-        overflowed: whether the state became NaN, infinite, or a million times its start.
+        overflowed: whether the state became NaN, larger than the root of the largest number, or so fast that time no
+            longer resolved its changes.
         stopped: whether ``stop_when`` held.
         interpolation: of a dense solution, from which `at` reads.
         method: the solver, and why it was taken.
@@ -133,11 +134,12 @@ class Solution(eqx.Module):
         """Raise `SolveError`, with causes and cures, where the run did not reach its end."""
         time = float(self.t_end)
         if bool(self.overflowed):
-            if self.is_fixed and not np.isfinite(np.asarray(self.u_end)).all():
+            if self.is_fixed:
                 raise SolveError(
-                    f"The step at t = {time:.4g} could not be made. Causes are (a) a dt beyond what the solver is "
-                    "stable for, (b) an implicit stage whose iteration did not converge, or (c) a state that "
-                    "overflowed. Take a shorter dt, or leave dt out for adaptive steps, which try shorter ones.",
+                    f"The state overflowed at t = {time:.4g}, or the step there could not be made. Causes are (a) a dt "
+                    "beyond what the solver is stable for, or with which an implicit stage cannot be solved: take a "
+                    "shorter dt, or leave dt out for adaptive steps, which try shorter ones; or (b) what is solved. "
+                    f"{_cause_of_overflow(surface)}",
                     time,
                     self,
                 )
@@ -179,8 +181,9 @@ def solve(
 
     Steps are adaptive unless ``dt`` is given; the error is measured in a root-mean-square norm over vertices and
     species, which does not depend on the size of the mesh. The default solver is `RKL2`, whose cost grows with the
-    square root of the stiffness; for linear equations and runs 1e5 times as long as the fastest decay `TRBDF2`, where
-    the extra `amg` is at hand and the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
+    square root of the stiffness; for linear equations and runs 4e4 times as long as the fastest decay (with other
+    tolerances than the default in proportion to ``rtol ** (-1 / 3)``) `TRBDF2`, where the extra `amg` is at hand and
+    the stiffness is known (not inside jit, grad or vmap); for ``Paper`` surfaces, whose
     eigenvalues are off the real axis, `diffrax.Tsit5`. ``solution.stats`` says which it was and why.
 
     Solvers: any explicit one of diffrax; `RKL2` (second order) and `RKL1` (first, with the maximum principle),
@@ -212,8 +215,9 @@ def solve(
             ``max_steps`` states. Explicit solvers interpolate by cubics, implicit ones linearly.
         preconditioner: what `multigrid` returned for this surface or a similar one, where it is not to be set up anew:
             for surfaces that are being traced.
-        checkpoint_dir: a folder in which to keep the state as the run goes. The run is then made of intervals that each
-            begin with a first step, and a run that is killed loses at most the last of them. Not inside jit.
+        checkpoint_dir: a folder in which to keep the state as the run goes: the last ones, and those at ``ts``. The run
+            is then made of intervals that each begin with a first step, and a run that is killed loses at most the
+            last of them. Not inside jit.
         checkpoint_every: the length of these intervals in time, which also end at ``ts``; by default a twentieth of the
             run.
         resume: whether to go on from what ``checkpoint_dir`` holds of the same call; the result is the same as that of
@@ -226,8 +230,9 @@ def solve(
 
     Raises:
         SolveError: the state overflowed, or the solver failed before t1.
-        ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative, times are
-            not in order, dt is beyond the stability of an explicit solver, or solver and dt do not go together.
+        ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative anywhere,
+            times are not in order, tolerances are not positive, dt is beyond the stability of an explicit solver, or
+            solver and dt do not go together.
         RestartError: ``checkpoint_dir`` holds the files of another run.
 
     Warns:
@@ -241,13 +246,14 @@ def solve(
     is_known = not any(isinstance(time, Tracer) for time in jax.tree.leaves(times))
     times = (np if is_known else jnp).asarray(times, surface.dtype)
     checks.times(t0, t1, times, dt)
+    checks.tolerances(rtol, atol)
     checks.finite(equation, u0)
     if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
         _warn_of_growth(surface)
     # As arrays, so that other tolerances need no compiling.
     relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
     if solver is None:
-        method, why = _choice(equation, surface, u0, t0, t1, dense)
+        method, why = _choice(equation, surface, u0, t0, t1, rtol, dense)
     else:
         method, why = without_matrices(solver), "chosen by the caller"
     if isinstance(method, SBDF2) and dt is None:
@@ -266,10 +272,12 @@ def solve(
     def advance(u, begin, end, times, grid):
         # Time in the state's own float type: diffrax multiplies the two.
         begin, end = jnp.asarray(begin, surface.dtype), jnp.asarray(end, surface.dtype)
-        return _solve(
+        found = _solve(
             equation, surface, u, begin, end, times, method, adjoint, _meter(progress), relative, absolute, grid,
-            max_steps, stop_when, dense, name,
+            max_steps, stop_when, dense,
         )  # fmt: skip
+        # Said here: the numbers in it would have every run compiled anew.
+        return dataclasses.replace(found, method=name)
 
     if checkpoint_every is not None and not checkpoint_every > 0:
         raise ValueError(f"Expected a positive length of intervals, found checkpoint_every = {checkpoint_every}.")
@@ -283,7 +291,7 @@ def solve(
             equation=fingerprint(equation),
             start=fingerprint((u0, float(t0))),  # type: ignore
             end=fingerprint((float(t1), times, dt, checkpoint_every)),  # type: ignore
-            solver=fingerprint((name, solver, rtol, atol, stop_when)),
+            solver=fingerprint((solver, type(method), "Jacobi" in why, rtol, atol, stop_when)),
         )
         keeper = Keeper(checkpoint_dir, run, resume)
         # As the steps have them: in the state's float type.
@@ -301,19 +309,19 @@ def _bound(equation: Equation, t: Array, surface: Surface, u: Array) -> Array:
 
 
 def _choice(
-    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike, dense: bool
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, t1: ArrayLike, rtol: ArrayLike, dense: bool
 ) -> tuple[diffrax.AbstractSolver, str]:
     """The solver that is taken where the caller names none, and why."""
     if isinstance(surface.scheme, Paper):
         return diffrax.Tsit5(), "the published operator has eigenvalues off the real axis and no cheap bound of them"
     explicit = "explicit, with as many stages as the stiffness asks for"
     bound = _bound(equation, jnp.asarray(t0, surface.dtype), surface, u0)
-    if any(isinstance(value, Tracer) for value in (bound, t0, t1)) or surface.is_traced or not is_available():
+    if any(isinstance(value, Tracer) for value in (bound, t0, t1, rtol)) or surface.is_traced or not is_available():
         return RKL2(), explicit
     span = float(bound) * (float(t1) - float(t0))  # type: ignore
     diffuses = bool(jnp.any(equation.diffusivities(u0) > 0))
     # Between long implicit steps there are lines only.
-    if span < _STIFF or not diffuses or not equation.is_affine or dense:
+    if span < _STIFF * float(np.asarray(rtol)) ** (-1 / 3) or not diffuses or not equation.is_affine or dense:
         return RKL2(), explicit
     return TRBDF2(), f"implicit, as the run is {span:.1e} times as long as the fastest decay"
 
@@ -344,16 +352,8 @@ def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.nd
         return None
     count = int(np.ceil((end - start) / dt - 1e-6))
     multiples = np.asarray(float(start) + dt * np.arange(1, count), ts.dtype)
-    # What is one time but for rounding is one: the ends first, then what is asked for, then the multiples.
     least = max(1e-6 * dt, 4 * float(np.finfo(ts.dtype).eps) * float(max(abs(start), abs(end))))
-    grid = np.array([start, end])
-    for times in (np.unique(np.asarray(ts)), multiples):
-        times = times[(times > start) & (times < end)]
-        nearest = np.abs(
-            times[:, None] - grid[np.clip(np.searchsorted(grid, times)[:, None] - [0, 1], 0, len(grid) - 1)]
-        )
-        grid = np.sort(np.concatenate([grid, times[nearest.min(axis=1, initial=np.inf) > least]]))
-    return grid
+    return without_twins(start, end, (np.asarray(ts), multiples), least)
 
 
 def _checkpoints(grid: np.ndarray | None, max_steps: int | None, u0: Array) -> diffrax.AbstractAdjoint:
@@ -390,15 +390,16 @@ def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractPr
     try:
         return diffrax.TqdmProgressMeter()
     except (ImportError, ValueError):  # tqdm belongs to the extra `app`
-        return diffrax.TextProgressMeter()
+        return TextMeter()
 
 
 @eqx.filter_jit
 def _solve(
-    equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense, method
+    equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense
 ) -> Solution:
     u0 = equation.held(t0, surface, u0)
-    largest = _OVERFLOW * jnp.maximum(1, jnp.max(jnp.abs(u0)))
+    # Products of what is larger are no numbers.
+    largest = jnp.sqrt(jnp.finfo(u0.dtype).max)
 
     # Not "is too large": a NaN compares false with everything.
     def has_overflowed(t, y, args, **_):
@@ -415,7 +416,7 @@ def _solve(
         # Of a known number of steps the checkpoints are few.
         max_steps = min(len(grid) - 1, max_steps) if max_steps is not None else len(grid) - 1
     else:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol)
+        controller: Any = Advancing(diffrax.PIDController(rtol=rtol, atol=atol))  # type: ignore
         bound = equation.spectral_bound(t0, surface, u0)
         # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
         dt0 = jnp.minimum(1 / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny), t1 - t0)
@@ -449,10 +450,10 @@ def _solve(
         counts["num_evaluations"] = cast(Any, out.solver_state)[1]
     happened = cast(dict[str, Array], out.event_mask)
     stopped = happened.get("stopped", jnp.array(False))
+    overflowed = happened["overflowed"] | (out.result == diffrax.RESULTS.dt_min_reached)
     return Solution(
-        ts, us, t_end[0], u_end[0], counts, out.result, happened["overflowed"], stopped, out.interpolation, method,
-        grid is not None,
-    )  # fmt: skip
+        ts, us, t_end[0], u_end[0], counts, out.result, overflowed, stopped, out.interpolation, "", grid is not None
+    )
 
 
 def _cause_of_overflow(surface: Surface) -> str:
@@ -462,6 +463,6 @@ def _cause_of_overflow(surface: Surface) -> str:
         return "The published operator (scheme paper) has growing modes on such meshes: use ltl.Monotone()."
     return (
         "Diffusion cannot grow with this scheme, so the cause is (a) a reaction or source that grows without bound, or "
-        "(b) an initial state that is not finite or far from where the reaction makes sense. Check the rates and the "
-        "initial state."
+        "(b) an initial state far from where the reaction makes sense. Check the rates and the initial state; where an "
+        "implicit solver cannot find its stages, take ltl.RKL2()."
     )

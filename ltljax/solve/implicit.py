@@ -52,6 +52,10 @@ class _Newton(optx.Newton):
 class Preconditioning(eqx.Module):
     """How stages are solved.
 
+    Without multigrid by Jacobi's method. Chebyshev polynomials in its place were measured and left out: on an icosphere
+    of 10,242 vertices those of degree eight take a quarter of the time, on random points, whose eigenvalues are off the
+    real axis, they do not converge; those that do (on a fifth of the interval) take as long as Jacobi's method.
+
     Attributes:
         multigrid: the hierarchy of the surface; None for Jacobi's method.
         rtol: relative tolerance of a step.

@@ -159,14 +159,67 @@ class GMRES(lx.AbstractLinearSolver):
         return True
 
 
+class Persistent(lx.AbstractLinearSolver):
+    """BiCGStab, and where that does not converge GMRES with a long memory: for operators far from their preconditioner.
+
+    Attributes:
+        quick: what is tried.
+        thorough: what is taken where that fails.
+    """
+
+    quick: BiCGStab
+    thorough: GMRES
+
+    def init(self, operator, options):
+        """The operator, which is not looked into."""
+        return self.quick.init(operator, options)
+
+    def compute(self, state, vector, options):
+        """The solution, whether it was found, and the number of iterations of whichever found it."""
+        x, result, stats = self.quick.compute(state, vector, options)
+
+        def again():
+            x, result, stats = self.thorough.compute(state, vector, options)
+            return x, result == lx.RESULTS.successful, jnp.asarray(stats["num_steps"], jnp.int32)
+
+        found = result == lx.RESULTS.successful
+        x, found, steps = jax.lax.cond(found, lambda: (x, found, stats["num_steps"].astype(jnp.int32)), again)
+        result = lx.RESULTS.where(found, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
+        return x, result, stats | {"num_steps": steps}
+
+    def transpose(self, state, options):
+        """The transposed operator, for which the preconditioner is transposed too."""
+        return self.quick.transpose(state, options)
+
+    def conj(self, state, options):
+        """The same: everything is real."""
+        return state, options
+
+    def assume_full_rank(self):
+        """Singular systems are made regular before they come here."""
+        return True
+
+
 def _rms(x: Array) -> Array:
     return jnp.sqrt(jnp.mean(x**2))
 
 
 def linear_solve(
-    apply: Callable[[Array], Array], b: Array, preconditioner: Preconditioner, tolerance: Any, max_steps: int = 200
+    apply: Callable[[Array], Array],
+    b: Array,
+    preconditioner: Preconditioner,
+    tolerance: Any,
+    max_steps: int = 200,
+    *,
+    persists: bool = False,
 ) -> lx.Solution:
-    """The x with ``apply(x) = b``, differentiable in b and in whatever ``apply`` closes over, in both modes."""
+    """The x with ``apply(x) = b``, differentiable in b and in whatever ``apply`` closes over, in both modes.
+
+    With ``persists`` a system that BiCGStab does not solve is given to GMRES, at the memory of a hundred states.
+    """
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: b))
-    solver = BiCGStab(tolerance, jax.lax.stop_gradient(preconditioner), max_steps)
+    preconditioner = jax.lax.stop_gradient(preconditioner)
+    solver: Any = BiCGStab(tolerance, preconditioner, max_steps)
+    if persists:
+        solver = Persistent(solver, GMRES(tolerance, preconditioner, restart=100, max_steps=30))
     return lx.linear_solve(operator, b, solver, throw=False)

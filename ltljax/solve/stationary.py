@@ -28,8 +28,11 @@ from .implicit import Preconditioning
 from .krylov import GMRES, linear_solve
 from .multigrid import Multigrid
 
-# A right side whose mean is more than this share of its size was not meant to have none.
+# A right side whose mean is more than this share of its size was not meant to have none; nor one that has more than
+# discretisation leaves of a mean that is none, which is at most this much over the number of vertices: 0.1 of it for
+# harmonics of low degree on random points, 0.6 for waves eight vertices long, and less on better meshes.
 _INCOMPATIBLE = 1e-2
+_DISCRETE = 4 * np.pi
 _MAX_MARCH = 500
 _MAX_NEWTON = 5
 _GROWN = 1e6
@@ -54,10 +57,12 @@ def poisson(
 
     Where nothing on a connected component holds or absorbs u, a solution exists only for an f without mean (in
     ``surface.mass``), and then up to a constant: the mean of f over the component is taken off, which is said if it is
-    more than a hundredth of f, and the u whose mean (in the vertex areas) is zero is returned.
+    more than discretisation makes of none (``4 pi`` over the number of vertices, of the size of f, or a hundredth), and
+    the u whose mean (in the vertex areas) is zero is returned.
 
-    By Krylov iteration preconditioned by multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many
-    more iterations), and differentiable in f, the data of the conditions and, with a ``preconditioner``, the vertices.
+    By Krylov iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by
+    multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many more iterations), and differentiable in
+    f, the data of the conditions and, with a ``preconditioner``, the vertices.
 
     Args:
         surface: the surface.
@@ -108,22 +113,32 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
     time = jnp.zeros((), f.dtype)
     u, mean, size, converged, steps = _stationary(equation, surface, start, time, screening, preconditioner, tolerance)
     if not isinstance(u, Tracer):
-        _say_incompatible(mean, size)
+        if said := _incompatible(surface, -mean, size):
+            warnings.warn(
+                f"The right side, fluxes included, has {said[0]} where nothing holds u, so that no solution exists. "
+                "The equation was solved for the right side without its mean.",
+                IncompatibleSourceWarning,
+                stacklevel=3,
+            )
         if throw and not bool(converged):
             raise SolveError(_unconverged(int(steps), preconditioner))
     return u
 
 
-def _say_incompatible(mean: Array, size: Array) -> None:
-    worst = float(jnp.max(jnp.abs(mean)))
-    if worst > _INCOMPATIBLE * float(size):
-        warnings.warn(
-            f"The right side, fluxes included, has a mean of {worst:.3g} (its root mean square is {float(size):.3g}) "
-            "over a component where nothing holds u, so that no solution exists. The equation was solved for the right "
-            "side without its mean.",
-            IncompatibleSourceWarning,
-            stacklevel=4,
-        )
+def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, float] | None:
+    """The largest of the means (one for each component and column) that are more than discretisation leaves, in words,
+    and as a share of what has it; None if there is none."""
+    components = np.asarray(surface.topology.components)
+    means, sizes = (np.asarray(a, np.float64).reshape(surface.topology.num_components, -1) for a in (mean, size))
+    least = np.minimum(_DISCRETE / np.bincount(components), _INCOMPATIBLE)
+    share = np.abs(means) / np.maximum(sizes, np.finfo(np.float64).tiny)
+    component, column = np.unravel_index(np.argmax(share / least[:, None]), share.shape)
+    at = (component, column)
+    if not share[at] > least[component]:
+        return None
+    where = f" over component {component}" * (len(means) > 1) + f" in column {column}" * (means.shape[1] > 1)
+    said = f"a mean of {means[at]:.3g}{where} (its root mean square there is {sizes[at]:.3g})"
+    return said, float(share[at])
 
 
 def _unconverged(steps: int, preconditioner: Multigrid | None) -> str:
@@ -136,8 +151,8 @@ def _stationary(
     equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array, multigrid: Multigrid | None,
     tolerance: Any,
 ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
-    """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes),
-    whether it was found, and in how many iterations."""
+    """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes) for
+    every component and column, whether it was found, and in how many iterations."""
     start = equation.held(time, surface, start)
     trailing = (1,) * (start.ndim - 1)
     is_held = bounds.held_vertices(surface, equation.conditions)
@@ -160,7 +175,7 @@ def _stationary(
         return jnp.where(is_free.reshape(-1, *trailing), mean, 0)
 
     def spread(means):
-        return means[surface.topology.components] * scale * diffusivities
+        return means[surface.topology.components] * scale * diffusivities[None]
 
     value, derivative = jax.linearize(rate, start)
 
@@ -171,16 +186,26 @@ def _stationary(
     flat = diffusivities.reshape(-1) if trailing else diffusivities[None]
     alpha = jnp.broadcast_to(jnp.mean(screening), flat.shape)
     inverse = Preconditioning(multigrid).of(surface, alpha, flat)
-    found = linear_solve(apply, right, inverse, tolerance, 200 if multigrid is not None else 20_000)
+    # Of high order the operator may be far from the one that preconditions it.
+    persists = not isinstance(surface.scheme, Monotone)
+    most = 200 if multigrid is not None else 20_000
+    found = linear_solve(apply, right, inverse, tolerance, most, persists=persists)
     constants = means(found.value)
     u = start + found.value - jnp.where(
         is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
     )  # fmt: skip
     load = rate(equation.held(time, surface, jnp.zeros_like(start)))
-    # With what rounding leaves of a mean that is none.
-    rounding = 1e3 * jnp.finfo(start.dtype).eps / _INCOMPATIBLE
-    size = jnp.sqrt(jnp.mean(load**2)) + rounding * jnp.sqrt(jnp.mean(value**2))
-    return u, constants * scale * diffusivities, size, found.result == lx.RESULTS.successful, found.stats["num_steps"]
+    # With what rounding and an unfinished iteration leave of a mean that is none.
+    rounding = (1e3 * jnp.finfo(start.dtype).eps + tolerance) / _INCOMPATIBLE
+    number = _over_components(surface, jnp.ones_like(surface.vertex_areas)).reshape(-1, *trailing)
+    size = jnp.sqrt(_over_components(surface, load**2) / number) + rounding * jnp.sqrt(jnp.mean(value**2))
+    return (
+        u,
+        constants * scale * diffusivities[None],
+        size,
+        found.result == lx.RESULTS.successful,
+        found.stats["num_steps"],
+    )
 
 
 def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum) -> Array:
@@ -201,11 +226,12 @@ def steady_state(
 ) -> Float[Array, "V *S"]:
     """A state at which the rate of an equation vanishes.
 
-    `Diffusion` is one linear system; where it conserves mass (nothing holds or absorbs), the state has the mass of u0.
+    `Diffusion` is one linear system, solved to rounding whatever the tolerance; where it conserves mass (nothing holds
+    or absorbs), the state has the mass of u0.
     Of a nonlinear equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
     rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
-    state is steady, then takes Newton's last step. Differentiable in reverse and forward mode by the implicit function
-    theorem, in everything but u0.
+    state is steady, then takes Newton's last step (for `Diffusion` the linear system). Differentiable in reverse and
+    forward mode by the implicit function theorem, in everything but u0.
 
     Args:
         equation: the equation.
@@ -221,24 +247,30 @@ def steady_state(
     Raises:
         SolveError: no stationary state was found, or there is none.
 
+    Warns:
+        IncompatibleSourceWarning: of `Diffusion`, source and fluxes have a small mean where they must have none.
+
     Source: Kelley and Keyes (1998), Convergence analysis of pseudo-transient continuation,
     doi:10.1137/S0036142996304796.
     """
     u0 = jnp.asarray(u0, surface.dtype)
     checks.state(surface, u0)
     checks.finite(equation, u0)
+    if not tolerance > 0 or not t1 > 0:
+        raise ValueError(f"Expected a positive tolerance and a positive t1, found {tolerance} and {t1}.")
     if method not in ("newton", "marching"):
         raise ValueError(f'Expected the method "newton" or "marching", found {method!r}.')
     preconditioner = hierarchy(equation, surface, u0, t) if preconditioner is None else preconditioner
     time = jnp.asarray(t, surface.dtype)
-    if isinstance(equation, Diffusion):
-        return _steady_diffusion(equation, surface, u0, time, preconditioner, throw)
+    first = u0
     if method == "marching":
         stopping = Steady(min(1e-4, 1e3 * tolerance))
         # The way there has no part in the derivative, and forward mode would not go through it.
         numbers, rest = eqx.partition((equation, surface, u0), eqx.is_inexact_array)
         still, where, u0 = eqx.combine(jax.lax.stop_gradient(numbers), rest)
         u0 = solve(still, where, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
+    if isinstance(equation, Diffusion):
+        return _steady_diffusion(equation, surface, u0, first, time, preconditioner, throw)
     u, rate, wanted, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
     if throw and not isinstance(u, Tracer) and not float(rate) <= float(wanted):
         raise SolveError(
@@ -249,20 +281,31 @@ def steady_state(
     return u
 
 
-def _steady_diffusion(equation: Diffusion, surface: Surface, u0: Array, time: Array, preconditioner, throw: bool):
+def _steady_diffusion(
+    equation: Diffusion, surface: Surface, start: Array, u0: Array, time: Array, preconditioner, throw: bool
+):
+    """The stationary state, sought from a start, that has the mass of u0."""
     # The data at this time, from here on without one.
     source = equation.explicit_rate(time, surface, u0)
     still = eqx.tree_at(lambda e: e.source, equation, source, is_leaf=lambda x: x is None)
     none = jnp.zeros(surface.num_vertices, u0.dtype)
     tolerance = 1e-11 if u0.dtype == jnp.float64 else 1e-5
-    u, mean, size, converged, steps = _stationary(still, surface, u0, time, none, preconditioner, tolerance)
+    u, mean, size, converged, steps = _stationary(still, surface, start, time, none, preconditioner, tolerance)
     if not isinstance(u, Tracer) and throw:
         if not bool(converged):
             raise SolveError(_unconverged(int(steps), preconditioner))
-        if float(jnp.max(jnp.abs(mean))) > _INCOMPATIBLE * float(size):
+        said, share = _incompatible(surface, mean, size) or ("", 0.0)
+        if share > _INCOMPATIBLE:
             raise SolveError(
-                f"There is no stationary state: source and fluxes have a mean of {float(jnp.max(jnp.abs(mean))):.3g} "
-                "and nothing takes it away, so that u grows for ever. Take the mean off, or hold u on a boundary."
+                f"There is no stationary state: source and fluxes have {said} and nothing takes it away, so that u "
+                "grows for ever. Take the mean off, or hold u on a boundary."
+            )
+        if said:
+            warnings.warn(
+                f"Source and fluxes have {said} and nothing takes it away, so that u grows for ever. The state is that "
+                "without the mean.",
+                IncompatibleSourceWarning,
+                stacklevel=3,
             )
     conserved = surface.mass if isinstance(surface.scheme, Monotone) and not surface.is_traced else surface.vertex_areas
     has_conditions = any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions)
@@ -291,9 +334,6 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
         # What is held returns to its value, which makes the system regular and lets derivatives see the data.
         return jnp.where(is_held, equation.held(time, surface, u) - u, equation.rate(time, surface, u))
 
-    # A state that grew this much has no end to its growth.
-    largest = _GROWN * jnp.maximum(rms(u0), 1)
-
     dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, 1e-6))
 
     def inverse(shift):
@@ -318,6 +358,8 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
         u, value, _, steps = carry
         return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH) & (rms(u) <= largest)
 
+    # A state that grew this much, over its start or what the rate there makes of it, has no end to its growth.
+    largest = _GROWN * jnp.maximum(jnp.maximum(rms(u0), rms(rate(u0)) * dt0), 1)
     frozen = jax.lax.stop_gradient((u0, rate(u0), dt0))
     u, _, _, steps = jax.lax.while_loop(goes_on, march, (*frozen, jnp.zeros((), jnp.int32)))
     u = jax.lax.stop_gradient(u)
