@@ -286,6 +286,15 @@ def test_rates_are_found_from_statistics_of_a_pattern(sphere):
     assert all(low[key] < truth[key] < high[key] for key in truth)
 
 
+def test_a_histogram_is_the_coverage_between_levels(sphere):
+    u, mass = sphere.vertices[:, 2], sphere.mass
+    found = ltl.pattern_statistics(sphere, u, mass, levels=[-0.5, 0.0, 0.5], softness=0.02)
+    # Heights on a sphere are distributed evenly (Archimedes).
+    np.testing.assert_allclose(found.histogram, [0.25, 0.25, 0.25, 0.25], atol=0.02)
+    assert float(found.histogram.sum()) == pytest.approx(1)
+    assert found.vector.shape == (7,)
+
+
 def test_the_statistics_tell_spots_from_holes_and_are_differentiable(sphere):
     x, mass = sphere.vertices, sphere.mass
     spots = jnp.exp(8 * (x[:, 2] - 1))
@@ -324,6 +333,18 @@ def test_a_source_of_two_bumps_is_found_from_a_noisy_stationary_state(sphere):
     assert (np.diff(curve[:, 1]) < 0).all()
     assert curve[-1, 1] <= values.size
     assert weight == curve[-1, 0]
+
+
+def test_a_discrepancy_that_no_weight_reaches_is_said_to_be_missed():
+    x = jnp.linspace(0.0, 1.0, 20)
+
+    def with_weight(weight, start):
+        del start
+        return ltl.fit(lambda p: p * x, 1.0, ltl.Observations(x**2 + 1, 0.01), penalty=lambda p: weight * p)
+
+    with pytest.warns(UserWarning, match="No weight down to 0.1 explains the data"):
+        weight, _, _ = ltl.choose_weight(with_weight, [1.0, 0.1])
+    assert weight == 0.1
 
 
 def test_the_l_curve_bends_at_a_good_weight():
@@ -681,6 +702,62 @@ def test_a_loss_that_does_not_answer_shows_no_gradient_to_be_right(loss):
     found = ltl.check_gradient(loss, 1.0)
     assert not found.passed
     assert "does not answer to steps of this size" in found.verdict
+
+
+FAMILIES = {
+    "explicit": (diffrax.Heun(), 0.01), "RKL2": (ltl.RKL2(), 0.05), "SBDF2": (ltl.SBDF2(), 0.05),
+    "TRBDF2": (ltl.TRBDF2(), 0.1), "stationary": (None, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_gradients_of_free_vertices_pass_taylors_test(name):
+    surface, (solver, dt) = ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), FAMILIES[name]
+    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+    u0 = jnp.cos(2 * x[:, 0]) + x[:, 1]
+
+    def loss(vertices):
+        moved = surface.with_vertices(vertices)
+        if solver is None:
+            u = ltl.screened_poisson(moved, u0, 1.0, rtol=1e-12, preconditioner=hierarchy)
+        else:
+            u = ltl.solve(
+                ltl.Diffusion(0.5), moved, u0, 0.2, solver=solver, dt=dt, rtol=1e-12, throw=False,
+                preconditioner=hierarchy,
+            ).u_end  # fmt: skip
+        return jnp.sum(u**2 * jnp.cos(x[:, 2]))
+
+    direction = 0.2 * np.random.default_rng(0).normal(size=x.shape)
+    found = ltl.check_gradient(loss, x, direction)
+    assert found.passed, found
+    assert found.slope == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), ltl.RKL2(), ltl.TRBDF2()], ids=lambda s: type(s).__name__)
+def test_tangents_beside_adaptive_steps_pass_taylors_test(solver):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+
+    @jax.jit
+    def loss(p):
+        kinetics = ltl.kinetics.schnakenberg(p["rate"], 0.9, rate=10.0)
+        end = ltl.solve(
+            ltl.ReactionDiffusion((0.1, 1.0), kinetics), surface.with_vertices(p["vertices"]), p["start"], 0.2,
+            solver=solver, adjoint=diffrax.ForwardMode(), rtol=1e-9, atol=1e-10, throw=False, preconditioner=hierarchy,
+        ).u_end  # fmt: skip
+        return jnp.sum(end**2 * jnp.cos(x[:, :2]))
+
+    at = dict(rate=jnp.array(0.1), start=1 + 0.1 * x[:, :2], vertices=x)
+    random = np.random.default_rng(0)
+    tangent = jax.jit(lambda direction: jax.jvp(loss, (at,), (direction,)))
+    for key, size in dict(rate=0.1, start=0.3, vertices=0.1).items():
+        still = {other: jnp.zeros_like(value) for other, value in at.items()}
+        direction = {**still, key: jnp.asarray(size * random.normal(size=at[key].shape))}
+        value, slope = tangent(direction)
+        rest = [
+            abs(loss(jax.tree.map(lambda a, d, h=h: a + h * d, at, direction)) - value - h * slope) for h in (0.1, 0.01)
+        ]
+        assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
 
 
 def test_a_report_and_its_picture(rates, sphere):
