@@ -30,6 +30,11 @@ _SAME = 1e-4
 _ANEW = "Fit without resume, or give another checkpoint."
 
 
+# A least-squares fit that crawls ends when so many steps together lower twice the loss by less than this share of the
+# variance of the noise.
+_CRAWLING, _IMMATERIAL = 12, 1e-3
+
+
 class FitError(RuntimeError):
     """A fit that could not begin: the model fails at the first guess."""
 
@@ -203,6 +208,8 @@ def fit(
             "The model has no finite derivatives at the start, though its prediction is finite. Look for a square "
             "root, a norm or a power of zero there, or begin elsewhere."
         )
+    # Half the variance of the noise, in the loss's unit.
+    unit, size = 0.0 if data.noise is None else 0.5, data.values.size
     options: dict[str, Any] = {}
     y, state, best = z, _begin(problem.solver, function, z, options), z
     losses: list[float] = []
@@ -237,6 +244,14 @@ def fit(
         if rejected >= seen.most:
             reason, converged = "no step lowers the loss any further", True
             break
+        if (
+            isinstance(problem.solver, Marquardt)
+            and not rejected
+            and len(losses) > _CRAWLING
+            and losses[-1 - _CRAWLING] - loss <= _IMMATERIAL * max(unit, loss / size)
+        ):
+            reason, converged = "the loss no longer changes", True
+            break
         if stop_when is not None and stop_when(step, loss, space.params(best)):
             reason = "stop_when held"
             break
@@ -261,23 +276,22 @@ def _begin(solver, function, z, options):
 
 
 @eqx.filter_jit
-def _step(solver, function, z, options, state):
-    before = state.f if isinstance(solver, optx.OptaxMinimiser) else state.f_info.as_min()
-    further, state, _ = solver.step(function, z, None, options, state, frozenset())
-    done, _ = solver.terminate(function, z, None, options, state, frozenset())
-    none = jnp.array(0)
+def _step(solver: Any, function: Any, z: Array, options: dict[str, Any], state: Any) -> tuple[Array, Any, _Seen]:
     if isinstance(solver, optx.OptaxMinimiser):
         # Its loss is that of the point the step began at.
-        return further, state, _Seen(z, state.f, done, none, none, 1)
+        further, state, _ = solver.step(function, z, None, options, state, frozenset())
+        none = jnp.array(0)
+        return further, state, _Seen(z, state.f, state.terminate, none, none, 1)
+    before = state.f_info.as_min()
+    further, state, _ = solver.step(function, z, None, options, state, frozenset())
+    done, _ = solver.terminate(function, z, None, options, state, frozenset())
+    loss, trials, most = state.f_info.as_min(), state.search_state, solver.search.most
     if not isinstance(solver, Marquardt):
         # In a minimum the loss's rounding may keep the solver from seeing that its steps lead nowhere.
         ahead = jnp.abs(state.y_eval - further)
         done |= jnp.all(ahead <= _SETTLED_STEP * (solver.rtol * jnp.abs(further) + solver.atol))
-        done |= (state.f_info.as_min() < before) & (before - state.f_info.as_min() <= SETTLED * state.f_info.as_min())
-    trials = state.search_state
-    return further, state, _Seen(
-        further, state.f_info.as_min(), done, trials.rejected, trials.failed, solver.search.most
-    )  # fmt: skip
+        done |= (loss < before) & (before - loss <= SETTLED * loss)
+    return further, state, _Seen(further, loss, done, trials.rejected, trials.failed, most)
 
 
 def _found(
