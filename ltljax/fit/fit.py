@@ -232,7 +232,7 @@ def fit(
             bar.set_postfix_str(f"loss {loss:.4g}")  # type: ignore
         if keeper is not None:
             if step == 0 and left is not None:
-                keeper.refuse_other(loss, left, float(jnp.linalg.norm(data.misfit(0 * data.values))))
+                keeper.refuse_other(loss, left)
             keeper.keep(best, loss)
         if bool(seen.done):
             reason, converged = "parameters or loss no longer change", True
@@ -325,7 +325,7 @@ class _Checkpoint:
     """
 
     def __init__(self, path: Path, space: Unknowns, data: Observations):
-        self.path, self.space = path, space
+        self.path, self.space, self.data = path, space, data
         self.fit = {"data": fingerprint(data), "ranges of parameters": fingerprint(space.transforms)}
 
     def keep(self, z: Array, loss: float) -> None:
@@ -359,9 +359,11 @@ class _Checkpoint:
         self.space = space
         return space, jnp.asarray(kept["unknowns"], scales[0].dtype), float(kept["loss"])
 
-    def refuse_other(self, loss: float, left: float, size: float) -> None:
-        """Raise where the model gives another loss than the one that was left, of data of some size."""
+    def refuse_other(self, loss: float, left: float) -> None:
+        """Raise where the model gives another loss than the one that was left."""
         here, there = np.sqrt(2 * loss), np.sqrt(2 * left)
+        noise = 1.0 if self.data.noise is None else np.asarray(self.data.noise)
+        size = np.linalg.norm(np.asarray(self.data.values) / noise)
         if not abs(here - there) <= _SAME * (there + size):
             raise RestartError(
                 f"{self.path} holds another fit: its loss was {left:.6g} where this model's is {loss:.6g}. {_ANEW}"

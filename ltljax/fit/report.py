@@ -12,8 +12,9 @@ from .observations import Observations
 from .unknowns import Unknowns
 
 # Adaptive steps are chosen anew for other parameters: what doubling the parameters changes by less than this share of
-# the predictions' spread may be their errors, and nothing that was seen.
-_UNSEEN = 5e-3
+# the predictions' spread may be their errors, and nothing that was seen. (Of a diffusivity that enters by the length of
+# the first step alone it is up to 0.64 %.)
+_UNSEEN = 1e-2
 # One standard deviation, relative, from which on a direction counts as not determined.
 _VAGUE = 0.5
 # Residuals that are so many times the noise are not noise.
