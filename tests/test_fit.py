@@ -504,7 +504,7 @@ def test_a_model_that_does_not_answer_is_fitted_to_nothing(method):
 
 def test_large_residuals_are_no_failure():
     x = np.linspace(1.0, 2.0, 20)
-    found = ltl.fit(lambda p: p * jnp.asarray(x), 1e12, ltl.Observations(2 * x, 1e-3))
+    found = ltl.fit(lambda p: p * jnp.asarray(x), 1e12, ltl.Observations(2 * x, 1e-3), atol=0.0)
     assert found.converged
     assert float(found.params) == pytest.approx(2.0)
 
@@ -657,9 +657,8 @@ def test_a_parameter_that_ran_to_its_bound_is_said_to_have():
     assert 1 - 1e-4 < float(found.params) <= 1
     assert "parameter has run to the end of its range, 1:" in found.summary()
     assert np.isfinite(found.evidence.singular_values).all()
-    # Wherever the parameter itself no longer moves, no derivative is left.
     spent = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
-    assert float(spent.params) == 1
+    assert 1 - 1e-4 < float(spent.params) <= 1
     assert "has run to the end of its range" in spent.summary()
     inside = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(0.9995 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
     assert "determine every parameter" in inside.summary()

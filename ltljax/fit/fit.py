@@ -203,7 +203,8 @@ def fit(
     problem = prepare(model, space, data, penalty, method, z, rtol, atol)
     converted = problem.converted(z)
     function = problem.function(converted, z)
-    if not bool(jnp.isfinite(function.scale)) and bool(jnp.isfinite(eqx.filter_jit(converted)(z)).all()):
+    # Of infinite derivatives it is zero.
+    if not 0 < float(function.scale) < np.inf and bool(jnp.isfinite(eqx.filter_jit(converted)(z)).all()):
         raise FitError(
             "The model has no finite derivatives at the start, though its prediction is finite. Look for a square "
             "root, a norm or a power of zero there, or begin elsewhere."
@@ -288,8 +289,8 @@ def _step(solver: Any, function: Any, z: Array, options: dict[str, Any], state: 
     loss, trials, most = state.f_info.as_min(), state.search_state, solver.search.most
     if not isinstance(solver, Marquardt):
         # In a minimum the loss's rounding may keep the solver from seeing that its steps lead nowhere.
-        ahead = jnp.abs(state.y_eval - further)
-        done |= jnp.all(ahead <= _SETTLED_STEP * (solver.rtol * jnp.abs(further) + solver.atol))
+        is_short = jnp.abs(state.y_eval - further) <= _SETTLED_STEP * (solver.rtol * jnp.abs(further) + solver.atol)
+        done |= jnp.all(is_short) & (trials.failed == 0)
         done |= (loss < before) & (before - loss <= SETTLED * loss)
     return further, state, _Seen(further, loss, done, trials.rejected, trials.failed, most)
 
