@@ -655,7 +655,7 @@ def test_a_parameter_that_ran_to_its_bound_is_said_to_have():
     x = jnp.linspace(0.0, 1.0, 20)
     found = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(1.02 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
     assert 1 - 1e-4 < float(found.params) <= 1
-    assert "parameter has run to the end of its range, 1:" in found.summary()
+    assert "parameter has run to the end of its range" in found.summary()
     assert np.isfinite(found.evidence.singular_values).all()
     spent = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
     assert 1 - 1e-4 < float(spent.params) <= 1
