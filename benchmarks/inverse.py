@@ -106,9 +106,9 @@ def solves():
     for label in ("first call", "second call"):
         begin = time.perf_counter()
         found = ltl.fit(experiment, start, data)
-        rows.append(("ltljax, Levenberg-Marquardt", label, found.num_steps, time.perf_counter() - begin, found.params))
+        rows.append(("ltljax, Levenberg-Marquardt", label, found.num_runs, time.perf_counter() - begin, found.params))
     flat, rebuild = ravel_pytree(jax.tree.map(jnp.asarray, start))
-    # A run that diverges is far from the data, as it is for ltljax.
+    # A run that diverges is far from the data; SciPy takes no infinity, which it is for ltljax.
     residuals = jax.jit(lambda z: jnp.nan_to_num(data.misfit(experiment(rebuild(z), times)), nan=1e8))
     np.asarray(residuals(flat))
     for method in ("trf", "lm"):

@@ -22,16 +22,18 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = Fals
     """Fit the numbers that a scenario leaves free, and write what was found.
 
     In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
-    ``fitted.toml``, the scenario with the numbers found, to be run; and while it goes ``unknowns.npz``, to resume from.
+    ``fitted.toml``, the scenario with the numbers found, to be run; and until it has converged ``unknowns.npz``, to
+    resume from.
 
     Args:
         example: the scenario.
         scheme: of the operators.
         out: the folder to write to; made if absent.
-        resume: whether to begin with what an interrupted fit left there.
+        resume: whether to begin with what an interrupted fit of the same data left there.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.
+        RestartError: what is there was left by another fit.
         FitError: the run fails at the first guess.
     """
     wanted = example.wanted
@@ -65,8 +67,8 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = Fals
 def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[str]:
     numbers = {key: float(value) for key, value in found.params.items()}
     record: dict[str, Any] = dict(
-        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, reason=found.reason,
-        converged=found.converged, method=found.method,
+        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, runs=found.num_runs,
+        reason=found.reason, converged=found.converged, method=found.method,
     )  # fmt: skip
     if (known := found.evidence) is not None:
         low, high = known.intervals
@@ -96,5 +98,6 @@ def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[s
     else:
         figure.savefig(out / "fit.png", dpi=110)
         files.append("fit.png")
-    (out / "unknowns.npz").unlink(missing_ok=True)
+    if found.converged:
+        (out / "unknowns.npz").unlink(missing_ok=True)
     return files

@@ -149,14 +149,81 @@ def test_a_model_that_does_not_explain_the_data_is_said_not_to():
     assert "determine every parameter" not in found.summary()
 
 
-def test_the_length_of_steps_is_no_information(sphere):
-    """A uniform mixture says nothing of diffusion, though the first step is as long as diffusion allows."""
+def test_what_shows_by_the_length_of_steps_alone_is_no_information(sphere):
+    """A uniform mixture says nothing of diffusion, though the first step is as long as diffusion allows.
+
+    Derivatives see that length, so the singular value of d is not zero; it is below what adaptive steps may err by.
+    """
     u0 = np.array([1.5, 0.5]) + 0 * bumpy(sphere)[:, None]
     experiment = ltl.Experiment(schnakenberg(sphere).equation, sphere, u0)
     data = ltl.Observations(experiment(TRUTH, TIMES).us, 1e-3, TIMES)
     found = ltl.fit(experiment, AWAY, data, transforms=ltl.Positive())
     assert found.singular_values[-1] < 1e-3 * found.singular_values[0]
     assert "d alone" in found.summary()
+    [said] = found.evidence.cannot_tell
+    assert "not seen at all" in said or "less than the errors that adaptive steps may have" in said
+
+
+def test_what_is_small_but_well_known_is_said_to_be_known():
+    """A model without steps errs by rounding alone, so the least effect of a parameter is seen."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(10_000, 2))
+    data = ltl.Observations(x @ [1000.0, 0.003] + 0.01 * rng.normal(size=len(x)), 0.01)
+    found = ltl.fit(lambda p: p["big"] * x[:, 0] + p["small"] * x[:, 1], dict(big=900.0, small=0.002), data)
+    assert not found.evidence.cannot_tell
+    assert "determine every parameter" in found.summary()
+    # Damping that suits the large one does not end the fit before the small one has moved.
+    best = np.linalg.lstsq(x, np.asarray(data.values))[0]
+    np.testing.assert_allclose([found.params["big"], found.params["small"]], best, rtol=1e-4)
+    assert found.evidence.std[1] == pytest.approx(1e-4, rel=0.05)
+
+
+def test_a_small_effect_of_adaptive_steps_is_not_safely_told(sphere):
+    """The noise would let it be known; the errors of the steps do not."""
+    u0 = np.array([1.0, 0.9]) + 0.1 * bumpy(sphere)[:, None] * np.array([1.0, -1.0])
+
+    def model(p, adjoint=None):
+        equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(p["a"], 0.9, rate=30.0))
+        u = ltl.solve(equation, sphere, u0, 0.05, adjoint=adjoint, throw=False).u_end
+        return u + 1e-4 * p["small"]
+
+    data = ltl.Observations(model(dict(a=jnp.array(0.1), small=jnp.array(1.0))), 1e-6)
+    [said] = ltl.fit(model, dict(a=0.11, small=0.9), data).evidence.cannot_tell
+    assert "do not safely tell" in said
+    assert "less than the errors that adaptive steps may have" in said
+    assert "not seen" not in said
+
+
+def test_as_many_values_as_unknowns_without_noise_have_no_error_bars():
+    model = lambda p: jnp.stack([p["a"] + p["b"], p["a"] - p["b"]])  # noqa: E731
+    found = ltl.fit(model, dict(a=1.0, b=1.0), ltl.Observations([1.0, 2.0]))
+    assert np.isnan(found.evidence.std).all()
+    assert "There are no error bars: 2 values for 2 unknowns" in found.summary()
+    assert "determine every parameter" not in found.summary()
+    known = ltl.fit(model, dict(a=1.0, b=1.0), ltl.Observations([1.0, 2.0], 0.1))
+    np.testing.assert_allclose(known.evidence.std, 0.1 / np.sqrt(2), rtol=1e-6)
+    assert "determine every parameter" in known.summary()
+
+
+def test_noise_is_estimated_from_the_data_not_from_the_penalty():
+    rng = np.random.default_rng(0)
+    design = rng.normal(size=(50, 30))
+    rows = np.concatenate([3 * np.eye(30), np.zeros((500, 30))])
+    values = design @ rng.normal(size=30) + 0.1 * rng.normal(size=50)
+    found = ltl.fit(
+        lambda p: jnp.asarray(design) @ p,
+        np.zeros(30),
+        ltl.Observations(values),
+        penalty=lambda p: jnp.asarray(rows) @ p,
+    )
+    inverse = np.linalg.inv(design.T @ design + rows.T @ rows)
+    best = inverse @ design.T @ values
+    # Degrees of freedom: the trace of the matrix that makes predictions of values.
+    free = 50 - np.trace(design @ inverse @ design.T)
+    noise = np.sqrt(np.sum((values - design @ best) ** 2) / free)
+    np.testing.assert_allclose(found.params, best, atol=1e-4)
+    assert found.evidence.noise == pytest.approx(noise, rel=1e-4)
+    np.testing.assert_allclose(found.covariance, noise**2 * inverse, rtol=1e-3, atol=1e-9)
 
 
 def test_a_profile_is_least_at_the_optimum_and_ends_the_interval(rates):
@@ -219,6 +286,15 @@ def test_rates_are_found_from_statistics_of_a_pattern(sphere):
     assert all(low[key] < truth[key] < high[key] for key in truth)
 
 
+def test_a_histogram_is_the_coverage_between_levels(sphere):
+    u, mass = sphere.vertices[:, 2], sphere.mass
+    found = ltl.pattern_statistics(sphere, u, mass, levels=[-0.5, 0.0, 0.5], softness=0.02)
+    # Heights on a sphere are distributed evenly (Archimedes).
+    np.testing.assert_allclose(found.histogram, [0.25, 0.25, 0.25, 0.25], atol=0.02)
+    assert float(found.histogram.sum()) == pytest.approx(1)
+    assert found.vector.shape == (7,)
+
+
 def test_the_statistics_tell_spots_from_holes_and_are_differentiable(sphere):
     x, mass = sphere.vertices, sphere.mass
     spots = jnp.exp(8 * (x[:, 2] - 1))
@@ -257,6 +333,18 @@ def test_a_source_of_two_bumps_is_found_from_a_noisy_stationary_state(sphere):
     assert (np.diff(curve[:, 1]) < 0).all()
     assert curve[-1, 1] <= values.size
     assert weight == curve[-1, 0]
+
+
+def test_a_discrepancy_that_no_weight_reaches_is_said_to_be_missed():
+    x = jnp.linspace(0.0, 1.0, 20)
+
+    def with_weight(weight, start):
+        del start
+        return ltl.fit(lambda p: p * x, 1.0, ltl.Observations(x**2 + 1, 0.01), penalty=lambda p: weight * p)
+
+    with pytest.warns(UserWarning, match="No weight down to 0.1 explains the data"):
+        weight, _, _ = ltl.choose_weight(with_weight, [1.0, 0.1])
+    assert weight == 0.1
 
 
 def test_the_l_curve_bends_at_a_good_weight():
@@ -349,21 +437,97 @@ def test_a_shape_is_found_by_an_eigenvalue(sphere):
     assert float(found.params["stretch"]) > 0.1  # longer, so slower
 
 
-def test_a_diverging_trial_step_is_rejected(sphere):
-    """From far off the first step would overflow the reaction."""
+LEAST_SQUARES = [optx.LevenbergMarquardt(1e-6, 1e-8), optx.Dogleg(1e-6, 1e-8), optx.GaussNewton(1e-6, 1e-8)]
+METHODS = [*LEAST_SQUARES, optx.BFGS(1e-6, 1e-8), optx.LBFGS(1e-6, 1e-8)]
+
+
+@pytest.fixture(scope="module")
+def explosive():
+    """u = 1 / (1 - r t), which ends at r = 1; what r = 0.9 gives, and the rates at which it was run."""
+    surface, tried = ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), []
 
     def model(p, adjoint=None):
+        jax.debug.callback(lambda r: tried.append(float(r)), p["r"])
         kinetics = ltl.kinetics.Kinetics(lambda u, q: (q["r"] * u[0] ** 2,), dict(r=p["r"]))
         equation = ltl.ReactionDiffusion((1.0,), kinetics)
-        u0 = jnp.ones((sphere.num_vertices, 1))
-        return ltl.solve(equation, sphere, u0, 1.0, adjoint=adjoint, throw=False)
+        u0 = jnp.ones((surface.num_vertices, 1))
+        return ltl.solve(equation, surface, u0, 1.0, adjoint=adjoint, throw=False, max_steps=300)
 
-    data = ltl.Observations(np.full((642, 1), 1 / (1 - 0.9)))  # u = 1 / (1 - r t), which ends at r = 1
-    found = ltl.fit(model, dict(r=0.1), data)
+    clean = model(dict(r=jnp.array(0.9))).u_end
+    np.testing.assert_allclose(clean, 1 / (1 - 0.9), rtol=0.05)
+    return model, ltl.Observations(clean), tried
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+def test_a_diverging_trial_step_is_rejected(explosive, method):
+    """From far off the first step would overflow the reaction."""
+    model, data, tried = explosive
+    tried.clear()
+    found = ltl.fit(model, dict(r=0.1), data, method=method)
+    jax.effects_barrier()
+    assert max(tried) > 1
+    assert np.isfinite(found.losses).all()
+    assert (np.diff(found.losses) <= 0).all()
     assert found.converged
     assert float(found.params["r"]) == pytest.approx(0.9, abs=1e-3)
+
+
+def test_a_start_that_fails_is_said_to(explosive):
+    model, data, _ = explosive
     with pytest.raises(ltl.FitError, match="fails at the start"):
         ltl.fit(model, dict(r=2.0), data)
+    with pytest.raises(ltl.FitError, match="no finite derivatives"):
+        ltl.fit(lambda p: jnp.sqrt(p) * jnp.ones(3), 0.0, ltl.Observations(np.ones(3)))
+    many = ltl.fit_many(model, dict(r=np.array([0.1, 2.0])), data)
+    assert many.converged.tolist() == [True, False]
+    assert np.isfinite(many.losses).tolist() == [True, False]
+    assert float(many.best["r"]) == pytest.approx(0.9, abs=1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+def test_a_fit_that_only_fails_from_where_it_is_has_not_converged(method):
+    model = lambda p: jnp.where(p <= 0.5, p, jnp.nan) * jnp.ones(5)  # noqa: E731
+    found = ltl.fit(model, 0.5, ltl.Observations(np.full(5, 10.0)), method=method)
+    assert not found.converged
+    assert "the model fails at every step from here" in found.reason
+    assert float(found.params) == 0.5
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+def test_a_model_that_does_not_answer_is_fitted_to_nothing(method):
+    found = ltl.fit(lambda p: 0 * p + jnp.arange(5.0), 2.0, ltl.Observations(np.arange(5.0) + 0.05, 0.1), method=method)
+    assert float(found.params) == 2.0
+    assert found.loss == pytest.approx(0.5 * 5 * 0.25)
+    if method in LEAST_SQUARES:
+        assert "not seen at all" in found.summary()
+
+
+def test_large_residuals_are_no_failure():
+    x = np.linspace(1.0, 2.0, 20)
+    found = ltl.fit(lambda p: p * jnp.asarray(x), 1e12, ltl.Observations(2 * x, 1e-3), atol=0.0)
+    assert found.converged
+    assert float(found.params) == pytest.approx(2.0)
+
+
+def test_runs_of_the_model_are_counted(explosive):
+    model, data, tried = explosive
+    tried.clear()
+    found = ltl.fit(model, dict(r=0.5), data)
+    jax.effects_barrier()
+    assert len(tried) == found.num_runs == found.num_steps + 2
+    assert f"{found.num_runs} runs of the model" in found.summary()
+
+
+def test_steps_of_optax_end_where_the_model_fails():
+    x = jnp.linspace(1.0, 2.0, 20)
+    data = ltl.Observations(2 * x, 0.1)
+    with jax.numpy_dtype_promotion("standard"):  # which optax counts on
+        found = ltl.fit(lambda p: jnp.where(p < 1.5, p, jnp.nan) * x, 1.0, data, method=optax.adam(0.1))
+    assert not found.converged
+    assert "the model fails where the optimiser went" in found.reason
+    assert 1.3 < float(found.params) < 1.5
+    # The loss is that of the parameters returned.
+    assert found.loss == pytest.approx(0.5 * np.sum(found.residuals**2))
 
 
 def test_a_fit_goes_on_where_it_was_left(rates, tmp_path):
@@ -377,6 +541,29 @@ def test_a_fit_goes_on_where_it_was_left(rates, tmp_path):
     assert relative(second.params, TRUTH) < 1e-3
     with pytest.raises(ValueError, match="another fit"):
         ltl.fit(lambda p: p * data.values, 1.0, data, checkpoint=kept, resume=True)
+
+
+def test_a_fit_goes_on_from_what_was_kept_whatever_the_start_and_refuses_what_another_left(tmp_path):
+    x, kept = jnp.linspace(0.0, 1.0, 20), tmp_path / "fit.npz"
+    model = lambda p: p["a"] * x + p["b"] ** 2  # noqa: E731
+    data = ltl.Observations(3 * x + 4, 0.1)
+    first = ltl.fit(model, dict(a=1.0, b=1.0), data, checkpoint=kept)
+    second = ltl.fit(model, dict(a=0.1, b=7.0), data, checkpoint=kept, resume=True)
+    for key, value in first.params.items():
+        assert float(second.params[key]) == pytest.approx(float(value), rel=1e-9)
+    assert second.num_steps == 1
+    start = dict(a=1.0, b=1.0)
+    for other, message in (
+        (dict(data=ltl.Observations(3 * x + 4, 0.2)), "its data differ"),
+        (dict(transforms=ltl.Positive()), "its ranges of parameters differ"),
+        (dict(model=lambda p: p["a"] * x + p["b"]), "its loss was"),
+        (dict(penalty=lambda p: p["a"]), "its loss was"),
+    ):
+        with pytest.raises(ltl.RestartError, match=f"holds another fit: {message}"):
+            ltl.fit(**(dict(model=model, start=start, data=data, checkpoint=kept, resume=True) | other))
+    kept.write_bytes(b"PK no zip")
+    with pytest.raises(ltl.RestartError, match="damaged"):
+        ltl.fit(model, start, data, checkpoint=kept, resume=True)
 
 
 def test_a_fit_stops_when_told_and_shows_its_progress(rates, capfd):
@@ -399,6 +586,8 @@ BAD = {
     "NaN": (lambda x: ltl.Observations(np.where(np.arange(len(x)) == 7, np.nan, 1.0)), r"nan at index \(7,\)"),
     "noise": (lambda x: ltl.Observations(np.ones(3), 0.0), "positive noise"),
     "noise shape": (lambda x: ltl.Observations(np.ones(3), np.ones(2)), "does not fit values"),
+    "noise of more": (lambda x: ltl.Observations(np.ones(3), np.ones((2, 3))), r"\(2, 3\) does not fit values \(3,\)"),
+    "negative species": (lambda x: ltl.Observations(np.ones(3), species=-1), "from 0, found -1"),
     "times": (lambda x: ltl.Observations(np.ones((2, 3)), times=[1.0, 0.5]), "ascending times"),
     "number of times": (lambda x: ltl.Observations(np.ones((2, 3)), times=[1.0]), "values for 1 times"),
     "negative vertex": (lambda x: ltl.Observations(np.ones(1), vertices=[-1]), "from 0, found -1"),
@@ -421,6 +610,10 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         (ltl.Observations(few, times=TIMES, vertices=[1, 2, 642]), "Vertex 642"),
         (ltl.Observations(few[..., 0], times=TIMES, vertices=[1, 2, 3], species=2), "Species 2"),
         (ltl.Observations(few[0]), "end of the run"),
+        (
+            ltl.Observations(few, times=TIMES, vertices=np.arange(10) < 3),
+            "a mask of the model's 642 vertices, found one of 10",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             ltl.fit(experiment, AWAY, data)
@@ -438,6 +631,12 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), method="lm")
     with pytest.raises(ValueError, match="low < high"):
         ltl.Bounded(1.0, 1.0)
+    with pytest.raises(ValueError, match="has but one"):
+        ltl.fit(lambda p: p * bumpy(sphere), 1.0, ltl.Observations(bumpy(sphere), species=0))
+    with pytest.raises(ValueError, match=r"nan at index \(1, 2\)"):
+        ltl.fit_many(
+            lambda p: p * jnp.ones(3), 1.0, ltl.Observations(np.ones(3)), values=np.where(np.eye(2, 3, 1), np.nan, 1.0)
+        )
     # A model without an adjoint can be differentiated in reverse alone.
     reverse = lambda p: experiment(p, TIMES).us  # noqa: E731
     with pytest.raises(ValueError, match="take adjoint="):
@@ -450,6 +649,19 @@ def test_bounded_parameters_stay_between_their_bounds():
         lambda p: p * jnp.asarray(x), 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0), max_steps=30
     )
     assert 0.99 < float(found.params) <= 1
+
+
+def test_a_parameter_that_ran_to_its_bound_is_said_to_have():
+    x = jnp.linspace(0.0, 1.0, 20)
+    found = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(1.02 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    assert 1 - 1e-4 < float(found.params) <= 1
+    assert "parameter has run to the end of its range" in found.summary()
+    assert np.isfinite(found.evidence.singular_values).all()
+    spent = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    assert 1 - 1e-4 < float(spent.params) <= 1
+    assert "has run to the end of its range" in spent.summary()
+    inside = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(0.9995 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    assert "determine every parameter" in inside.summary()
 
 
 def test_a_right_gradient_passes_and_a_wrong_one_is_named(sphere):
@@ -470,8 +682,83 @@ def test_a_right_gradient_passes_and_a_wrong_one_is_named(sphere):
     assert "right to 0.2 %, no better" in slightly.verdict
     rounded = ltl.check_gradient(lambda p: jnp.sin(p) + 1e-4 * jnp.sin(1e7 * jax.lax.stop_gradient(p)), 1.0)
     assert "noisy" in rounded.verdict
+    # In a session the table is what is shown.
+    assert repr(wrong) == str(wrong)
     with pytest.raises(ValueError, match="one finite number"):
         ltl.check_gradient(lambda p: jnp.log(p), -1.0)
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        lambda p: 1e12 + jax.lax.stop_gradient(p),
+        lambda p: jnp.float32(1) + jnp.float32(1e-4) * jax.lax.stop_gradient(p).astype(jnp.float32),
+        lambda p: 0 * p,
+    ],
+    ids=["float64", "float32", "constant"],
+)
+def test_a_loss_that_does_not_answer_shows_no_gradient_to_be_right(loss):
+    found = ltl.check_gradient(loss, 1.0)
+    assert not found.passed
+    assert "does not answer to steps of this size" in found.verdict
+
+
+FAMILIES = {
+    "explicit": (diffrax.Heun(), 0.01), "RKL2": (ltl.RKL2(), 0.05), "SBDF2": (ltl.SBDF2(), 0.05),
+    "TRBDF2": (ltl.TRBDF2(), 0.1), "stationary": (None, None),
+}  # fmt: skip
+IN_FULL = {"explicit", "SBDF2", "TRBDF2"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(f, marks=[pytest.mark.slow] if f in IN_FULL else []) for f in FAMILIES])
+def test_gradients_of_free_vertices_pass_taylors_test(name):
+    surface, (solver, dt) = ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), FAMILIES[name]
+    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+    u0 = jnp.cos(2 * x[:, 0]) + x[:, 1]
+
+    def loss(vertices):
+        moved = surface.with_vertices(vertices)
+        if solver is None:
+            u = ltl.screened_poisson(moved, u0, 1.0, tolerance=1e-12, preconditioner=hierarchy)
+        else:
+            u = ltl.solve(
+                ltl.Diffusion(0.5), moved, u0, 0.2, solver=solver, dt=dt, rtol=1e-12, throw=False,
+                preconditioner=hierarchy,
+            ).u_end  # fmt: skip
+        return jnp.sum(u**2 * jnp.cos(x[:, 2]))
+
+    direction = 0.2 * np.random.default_rng(0).normal(size=x.shape)
+    found = ltl.check_gradient(loss, x, direction)
+    assert found.passed, found
+    assert found.slope == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), ltl.RKL2(), ltl.TRBDF2()], ids=lambda s: type(s).__name__)
+def test_tangents_beside_adaptive_steps_pass_taylors_test(solver):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+
+    @jax.jit
+    def loss(p):
+        kinetics = ltl.kinetics.schnakenberg(p["rate"], 0.9, rate=10.0)
+        end = ltl.solve(
+            ltl.ReactionDiffusion((0.1, 1.0), kinetics), surface.with_vertices(p["vertices"]), p["start"], 0.1,
+            solver=solver, adjoint=diffrax.ForwardMode(), rtol=1e-9, atol=1e-10, throw=False, preconditioner=hierarchy,
+        ).u_end  # fmt: skip
+        return jnp.sum(end**2 * jnp.cos(x[:, :2]))
+
+    at = dict(rate=jnp.array(0.1), start=1 + 0.1 * x[:, :2], vertices=x)
+    random = np.random.default_rng(0)
+    tangent = jax.jit(lambda direction: jax.jvp(loss, (at,), (direction,)))
+    for key, size in dict(rate=0.1, start=0.3, vertices=0.1).items():
+        still = {other: jnp.zeros_like(value) for other, value in at.items()}
+        direction = {**still, key: jnp.asarray(size * random.normal(size=at[key].shape))}
+        value, slope = tangent(direction)
+        rest = [
+            abs(loss(jax.tree.map(lambda a, d, h=h: a + h * d, at, direction)) - value - h * slope) for h in (0.1, 0.01)
+        ]
+        assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
 
 
 def test_a_report_and_its_picture(rates, sphere):

@@ -71,17 +71,17 @@ def test_with_noise_of_one_percent_the_truth_is_in_the_interval(name, where):
     clean = np.asarray(experiment(truth, times).us)
     level = 0.01 * clean.std()
     inside = dict.fromkeys(truth, 0)
+    # From 30 % off once; then from what that gave, which is where each fit ends.
     for seed in range(20):
         values = clean + level * np.random.default_rng(seed).normal(size=clean.shape)
         found = ltl.fit(experiment, start, ltl.Observations(values, level, times), transforms=ltl.Positive())
         assert errors(found, truth) < 0.03
         low, high = found.intervals
+        start = found.params
         for key, value in truth.items():
             inside[key] += bool(low[key] < value < high[key])
     print(name, where, inside)
-    # 18 of 20 for the set as a whole; one parameter by itself may have a worse seed.
-    assert np.mean(list(inside.values())) >= 18
-    assert min(inside.values()) >= 17
+    assert min(inside.values()) >= 18
 
 
 @pytest.mark.slow
@@ -113,8 +113,8 @@ def test_eight_unknowns_take_a_fifth_of_the_runs_that_finite_differences_take():
     wanted = jax.flatten_util.ravel_pytree(truth)[0]
     np.testing.assert_allclose(jax.flatten_util.ravel_pytree(ours.params)[0], wanted, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(theirs.x, wanted, rtol=1e-3, atol=1e-4)
-    print(f"{ours.num_steps} runs with derivatives, {runs} without")
-    assert runs >= 5 * ours.num_steps
+    print(f"{ours.num_runs} runs with derivatives, {runs} without")
+    assert runs >= 5 * ours.num_runs
 
 
 @pytest.mark.slow
@@ -149,3 +149,120 @@ def test_a_source_of_two_bumps_is_found_on_a_rabbit():
     print(f"relative L2 error {error:.3f}, centres off by {np.array(off) / step} mesh sizes")
     assert error < 0.15
     assert max(off) < 2 * step
+
+
+@pytest.fixture(scope="module")
+def small():
+    return ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.01])
+def test_rates_of_turk_are_recovered_from_snapshots(small, share):
+    u0 = 4 + 0.3 * waves(small)[:, None] * np.array([1.0, -1.0])
+    experiment = ltl.Experiment(
+        lambda p: ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turk(p["s"], p["alpha"], p["beta"])), small, u0
+    )
+    truth, times = dict(s=10.0, alpha=16.0, beta=12.0), np.array([0.02, 0.05, 0.1])
+    clean = np.asarray(experiment(truth, times).us)
+    level = share * clean.std()
+    values = clean + level * np.random.default_rng(0).normal(size=clean.shape)
+    start = dict(s=13.0, alpha=12.8, beta=9.6)
+    found = ltl.fit(experiment, start, ltl.Observations(values, level or None, times), transforms=ltl.Positive())
+    assert found.converged
+    assert errors(found, truth) < (0.01 if share else 1e-5)
+    if share:
+        low, high = found.intervals
+        assert all(low[key] < value < high[key] for key, value in truth.items())
+
+
+class Conduction(ltl.Equation):
+    """u_t = div(g grad u)."""
+
+    conductivity: jax.Array
+
+    def rate(self, t, surface, u):
+        return ltl.weighted_laplacian(surface, self.conductivity, u)
+
+    def spectral_bound(self, t, surface, u):
+        return jnp.max(self.conductivity) * ltl.operators.spectral_bound(surface)
+
+
+@pytest.mark.slow
+def test_a_diffusivity_field_is_found_with_tikhonovs_penalty_and_the_discrepancy_rule(small):
+    x, mass = np.asarray(small.vertices), small.mass
+    truth = 0.8 * np.exp(-((x - [0, 0, 1]) ** 2).sum(axis=1) / 0.5) - 0.5 * x[:, 0]
+    experiment = ltl.Experiment(
+        lambda p: Conduction(jnp.exp(p["log"])), small, waves(small), dt=0.01, solver=ltl.RKL2()
+    )
+    times = np.array([0.02, 0.05, 0.1])
+    clean = np.asarray(experiment(dict(log=jnp.asarray(truth)), times).us)
+    level = 0.01 * clean.std()
+    data = ltl.Observations(clean + level * np.random.default_rng(1).normal(size=clean.shape), level, times)
+
+    def with_weight(weight, start):
+        return ltl.fit(
+            experiment, dict(log=np.zeros(len(x))) if start is None else start, data,
+            penalty=lambda p: ltl.smoothness(small, p["log"], weight, mass), max_steps=150,
+        )  # fmt: skip
+
+    weight, found, curve = ltl.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0])
+    assert curve[-1, 1] <= data.values.size
+    assert weight == curve[-1, 0] < 1000
+    error = np.linalg.norm(found.params["log"] - truth) / np.linalg.norm(truth)
+    print(f"weight {weight:g}, relative error of the logarithm {error:.3f}")
+    assert error < 0.35
+
+
+def smallest_angle(vertices, faces):
+    corners = np.asarray(vertices)[faces]
+    sides = np.roll(corners, -1, axis=1) - corners
+    sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
+    return np.degrees(np.arccos((-sides * np.roll(sides, 1, axis=1)).sum(axis=-1))).min()
+
+
+@pytest.mark.slow
+def test_free_vertices_give_a_stationary_field_a_wanted_value_and_the_mesh_stays_good(small):
+    """Every coordinate is free; what keeps triangles good is that neighbours are to move alike."""
+    x, faces = small.vertices, np.asarray(small.faces)
+    source, south = jnp.exp(-8 * (1 - x[:, 2])), int(jnp.argmin(x[:, 2]))
+    hierarchy = ltl.multigrid(small)
+
+    def warmth(p):
+        moved = small.with_vertices(x + p["move"])
+        return ltl.screened_poisson(moved, -source, preconditioner=hierarchy)[south]
+
+    before = float(warmth(dict(move=0 * x)))
+    found = ltl.fit(
+        warmth, dict(move=np.zeros(x.shape)), ltl.Observations(1.3 * before, 1e-3 * before),
+        penalty=lambda p: [ltl.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_steps=80,
+    )  # fmt: skip
+    vertices = np.asarray(x + found.params["move"])
+    anew = ltl.Surface.from_mesh(ltl.Mesh(vertices, faces))
+    assert float(ltl.screened_poisson(anew, -source)[south]) == pytest.approx(1.3 * before, rel=3e-3)
+    assert smallest_angle(vertices, faces) > 0.8 * smallest_angle(x, faces)
+
+
+@pytest.mark.slow
+def test_rates_are_found_from_wavelength_coverage_and_histogram_of_a_pattern(small):
+    """Of runs from other starts, so that no spot is where it was."""
+    mass = small.mass
+
+    def state(p, seed, adjoint=None):
+        push = np.roll(waves(small), 7 * seed)
+        u0 = np.array([1.0, 0.9]) + 0.1 * push[:, None] * np.array([1.0, -1.0])
+        equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=60.0))
+        return ltl.solve(equation, small, u0, 2.0, adjoint=adjoint, throw=False).u_end[:, 0]
+
+    def statistics(p, seed=1, adjoint=None):
+        found = ltl.pattern_statistics(small, state(p, seed, adjoint), mass, levels=[0.6, 1.0, 1.6])
+        return jnp.concatenate([found.wavelength[None], found.histogram[:-1]])
+
+    truth = dict(a=0.1, b=0.9)
+    runs = np.array([statistics(truth, seed) for seed in range(2, 10)])
+    data = ltl.Observations(runs.mean(axis=0), runs.std(axis=0))
+    found = ltl.fit(statistics, dict(a=0.12, b=0.85), data, transforms=ltl.Positive())
+    print(found)
+    assert errors(found, truth) < 0.15
+    low, high = found.intervals
+    assert all(low[key] < value < high[key] for key, value in truth.items())

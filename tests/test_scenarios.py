@@ -13,6 +13,7 @@ import ltljax as ltl
 from ltljax import scenario
 from ltljax.cli import main
 from ltljax.output import files
+from ltljax.scenario import observed
 from ltljax.scenario.written import KINETICS
 
 PLAIN = """
@@ -409,7 +410,9 @@ def keep(kind, folder, name, state, mesh):
     elif kind == "csv":
         some = np.arange(0, len(state), 3)
         rows = np.column_stack([some, state[some]])
-        np.savetxt(path, rows, delimiter=",", header="vertex,u,v", comments="", fmt=["%d", "%.9g", "%.9g"])
+        # With the mark that spreadsheets begin a file with.
+        head = "\ufeffvertex,u,v"
+        np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt=["%d", "%.9g", "%.9g"], encoding="utf-8")
     elif kind == "vtp":
         files.write_vtp(path, mesh.vertices, mesh.faces, dict(u=state[:, 0], v=state[:, 1]))
     else:
@@ -445,6 +448,38 @@ def test_numbers_of_a_file_are_found_from_files_of_data(kind, seen, tmp_path, ca
     assert "fit" not in fitted
     example = scenario.read((out / "fitted.toml").read_text(), "fitted", out)
     assert example.wanted is None
+
+
+def test_columns_of_a_ply_file_are_all_but_the_positions(tmp_path):
+    path = tmp_path / "seen.ply"
+    head = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    head += "".join(f"property double {name}\n" for name in ("x", "y", "z", "xy", "u")) + "end_header\n"
+    path.write_text(head + "1 2 3 4 5\n")
+    assert {name: float(values[0]) for name, values in observed._ply(path).items()} == dict(xy=4.0, u=5.0)
+
+
+def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_path, capsys):
+    mesh, states = seen
+    for name, state in zip(("early", "late"), states, strict=True):
+        keep("npz", tmp_path, name, state, mesh)
+    text = PLAIN.replace("rate = 30.0", "rate = 30.0\na = 0.13").replace("v = 10.0", "v = 8.0") + SOUGHT
+    (tmp_path / "mine.toml").write_text(text.replace("noise = 0.002", "noise = 0.002\nmax_steps = 2"))
+    (tmp_path / "on.toml").write_text(text)
+    (tmp_path / "other.toml").write_text(text.replace("noise = 0.002", "noise = 0.004"))
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["fit", str(tmp_path / "mine.toml"), *out]) == 0
+    left = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert not left["converged"]
+    capsys.readouterr()
+    assert main(["fit", str(tmp_path / "other.toml"), "--resume", *out]) == 2
+    assert "holds another fit: its data differ" in capsys.readouterr().err
+    # With another start, whose place what was kept takes.
+    assert main(["fit", str(tmp_path / "on.toml"), "--set", "kinetics.a=0.3", "--resume", *out]) == 0
+    found = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert found["converged"]
+    assert found["loss"] < left["loss"]
+    assert found["found"]["kinetics.a"] == pytest.approx(0.1, rel=0.05)
+    assert not (tmp_path / "out" / "unknowns.npz").exists()
 
 
 BROKEN_FITS = {

@@ -11,7 +11,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .observations import Observations
+from .observations import Observations, refuse_non_finite
 from .problem import FitResiduals, Model, Residuals, forward_adjoint, prepare
 from .unknowns import unknowns
 
@@ -21,7 +21,7 @@ class ManyFits(eqx.Module):
 
     Attributes:
         params: the parameters, with the fits along a new first axis.
-        losses: (N,) of each.
+        losses: (N,) of each; infinite where the model fails at the start.
         num_steps: (N,).
         converged: (N,).
     """
@@ -69,7 +69,9 @@ def fit_many(
     """
     many = None if values is None else jnp.asarray(values, data.values.dtype)
     if many is not None and many.shape[1:] != data.values.shape:
-        raise ValueError(f"Expected values of shape (N, {data.values.shape}), found {many.shape}.")
+        raise ValueError(f"Expected values of shape (N, *{data.values.shape}), found {many.shape}.")
+    if many is not None:
+        refuse_non_finite(np.asarray(many))
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(starts)]
     shapes = {leaf.shape[:1] for leaf in leaves}
     if values is None and (len(shapes) != 1 or shapes == {()}):
@@ -92,7 +94,8 @@ def fit_many(
         call = optx.least_squares if problem.is_least_squares else optx.minimise
         out = call(function, problem.solver, z, has_aux=True, throw=False, max_steps=max_steps)
         loss = 0.5 * jnp.sum(converted(out.value) ** 2)
-        return space.params(out.value), loss, out.stats["num_steps"], out.result == optx.RESULTS.successful
+        converged = (out.result == optx.RESULTS.successful) & jnp.isfinite(loss)
+        return space.params(out.value), loss, out.stats["num_steps"], converged
 
     def whole(given):
         return one(given, None) if many is None else one(z[0], given)
@@ -133,7 +136,7 @@ def explore(
         logarithmic: whether positive ranges are filled evenly in the logarithm.
 
     Returns:
-        The guesses, along a first axis of every leaf, the best first; and their losses.
+        The guesses, along a first axis of every leaf, the best first; and their losses, infinite where the model fails.
 
     Raises:
         ValueError: a range is empty, or data and model do not go together.

@@ -34,6 +34,7 @@ class Observations(eqx.Module):
     times: np.ndarray | None
     vertices: np.ndarray | None
     species: tuple[int, ...] | None = eqx.field(static=True)
+    _mask_size: int | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -48,20 +49,20 @@ class Observations(eqx.Module):
         host = np.asarray(self.values)
         if host.size == 0:
             raise ValueError("Expected at least one observed value, found none.")
-        if not np.isfinite(host).all():
-            first = tuple(int(i) for i in np.argwhere(~np.isfinite(host))[0])
-            raise ValueError(
-                f"Expected finite observations, found {host[first]} at index {first} ({(~np.isfinite(host)).sum()} "
-                "such values in all). Leave these vertices out with vertices=."
-            )
+        refuse_non_finite(host)
         self.noise = None if noise is None else jnp.asarray(noise, dtype)
         if self.noise is not None:
             if not bool(jnp.all(jnp.isfinite(self.noise) & (self.noise > 0))):
                 raise ValueError("Expected a positive noise level; for values without noise leave it out.")
             try:
-                np.broadcast_shapes(self.noise.shape, host.shape)
+                fits = np.broadcast_shapes(self.noise.shape, host.shape) == host.shape
             except ValueError:
-                raise ValueError(f"A noise of shape {self.noise.shape} does not fit values {host.shape}.") from None
+                fits = False
+            if not fits:
+                raise ValueError(
+                    f"A noise of shape {self.noise.shape} does not fit values {host.shape}: expected one number, or a "
+                    "shape that broadcasts to the values'."
+                )
         self.times = None if times is None else np.atleast_1d(np.asarray(times, np.float64))
         if self.times is not None:
             if self.times.ndim != 1 or not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
@@ -69,14 +70,18 @@ class Observations(eqx.Module):
             if host.shape[0] != len(self.times):
                 raise ValueError(f"Expected values for {len(self.times)} times, found values of shape {host.shape}.")
         seen = None if vertices is None else np.asarray(vertices)
+        self._mask_size = None
         if seen is not None:
-            seen = np.flatnonzero(seen) if seen.dtype == bool else seen
+            if seen.dtype == bool:
+                self._mask_size, seen = seen.size, np.flatnonzero(seen) if seen.ndim == 1 else seen
             if seen.ndim != 1 or not np.issubdtype(seen.dtype, np.integer):
                 raise ValueError(f"Expected vertices as indices (N,) or a mask (V,), found {vertices!r}.")
             if (seen < 0).any():
                 raise ValueError(f"Expected vertices from 0, found {seen.min()}.")
         self.vertices = seen
-        self.species = (species,) if isinstance(species, int) else None if species is None else tuple(species)
+        self.species = None if species is None else tuple(int(s) for s in np.atleast_1d(species))
+        if self.species is not None and (not self.species or min(self.species) < 0):
+            raise ValueError(f"Expected species as columns of the state, from 0, found {species!r}.")
 
     def of(self, prediction: Any) -> Array:
         """What a model's prediction, a `Solution`, states or a statistic, says of the values observed."""
@@ -99,9 +104,15 @@ class Observations(eqx.Module):
         states = prediction.us if is_solution and self.times is not None else prediction
         shape = (states.u_end if isinstance(states, Solution) else states).shape
         axis = 0 if self.times is None else 1
+        if self._mask_size is not None and len(shape) > axis and self._mask_size != shape[axis]:
+            raise ValueError(
+                f"Expected a mask of the model's {shape[axis]} vertices, found one of {self._mask_size}."
+            )  # fmt: skip
         if self.vertices is not None and len(shape) > axis and (self.vertices >= shape[axis]).any():
             raise ValueError(f"Vertex {self.vertices.max()} was observed; the model has {shape[axis]} vertices.")
-        if self.species is not None and len(shape) > axis + 1 and max(self.species) >= shape[axis + 1]:
+        if self.species is not None and len(shape) <= axis + 1:
+            raise ValueError(f"Species {max(self.species)} was observed; the model has but one: leave species= out.")
+        if self.species is not None and max(self.species) >= shape[axis + 1]:
             raise ValueError(f"Species {max(self.species)} was observed; the model has {shape[axis + 1]} species.")
         found = jax.eval_shape(self.of, prediction).shape
         if found != self.values.shape:
@@ -114,6 +125,17 @@ class Observations(eqx.Module):
         """(prediction - value) / noise, of every value."""
         noise = 1.0 if self.noise is None else self.noise
         return jnp.ravel((self.of(prediction) - self.values) / noise)
+
+
+def refuse_non_finite(values: np.ndarray) -> None:
+    """Raise `ValueError` where a value is NaN or infinite."""
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        first = tuple(int(i) for i in bad[0])
+        raise ValueError(
+            f"Expected finite observations, found {values[first]} at index {first} ({len(bad)} such values in all). "
+            "Leave these vertices out with vertices=."
+        )
 
 
 class Experiment(eqx.Module):

@@ -1,5 +1,6 @@
 """What is known of a field beside the data: that it is smooth, or made of patches; and how much that should weigh."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -81,6 +82,9 @@ def choose_weight(
 
     Raises:
         ValueError: an unknown rule, no weights, or with the discrepancy principle noise that is not known.
+
+    Warns:
+        UserWarning: no weight leaves as little as the noise explains; the least weight is returned.
     """
     if rule not in ("discrepancy", "l-curve"):
         raise ValueError(f"Expected rule 'discrepancy' or 'l-curve', found {rule!r}.")
@@ -98,6 +102,12 @@ def choose_weight(
         if rule == "discrepancy" and misfit <= found.residuals.size:
             break
     table = np.array(curve)
+    if rule == "discrepancy" and table[-1, 1] > fits[-1].residuals.size:
+        warnings.warn(
+            f"No weight down to {table[-1, 0]:g} explains the data: the misfit is {table[-1, 1]:.4g}, of noise "
+            f"{fits[-1].residuals.size}. Try smaller weights or more max_steps, or doubt the model or the noise.",
+            stacklevel=2,
+        )
     if rule == "discrepancy" or len(table) < 3:
         return curve[-1][0], fits[-1], table
     best = int(np.argmax(_bend(np.log(table[:, 1]), np.log(np.maximum(table[:, 2] / table[:, 0], 1e-300)))))

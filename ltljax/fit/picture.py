@@ -48,8 +48,11 @@ def _against(axes: Any, fit: Any, data: Observations) -> None:
 def _strongest(covariance: np.ndarray) -> list[tuple[int, int]]:
     """The pairs of parameters that are most correlated."""
     std = np.sqrt(np.diag(covariance))
-    correlation = np.abs(covariance / np.outer(std, std))
     rows, columns = np.triu_indices(len(std), 1)
+    # Without those whose errors are not known.
+    known = np.isfinite(std) & (std > 0)
+    rows, columns = rows[known[rows] & known[columns]], columns[known[rows] & known[columns]]
+    correlation = np.abs(covariance / np.outer(np.where(known, std, 1.0), np.where(known, std, 1.0)))
     order = np.argsort(-correlation[rows, columns])[:_PAIRS]
     return [(int(rows[k]), int(columns[k])) for k in order]
 

@@ -14,16 +14,12 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from .methods import MANY, method_of
 from .observations import Experiment, Observations
 from .unknowns import Unknowns
 
-# From this many unknowns on Jacobians are not formed: gradients in reverse mode feed L-BFGS.
-MANY = 64
-# In units of the noise: what a model that fails predicts, so that a step to it is rejected.
-FAR = 1e8
 # The first damping, relative to the Jacobian's norm: after Marquardt (1963), who begins with a hundredth of its square.
 _DAMPING = 0.1
-_TINY = 1e-30
 
 Model = Experiment | Callable[..., Any]
 Residuals = Callable[[Any], Any]
@@ -46,11 +42,11 @@ class FitResiduals(eqx.Module):
         return self.model(params) if self.adjoint is None else self.model(params, adjoint=self.adjoint)
 
     def __call__(self, z: Array) -> Array:
-        """(M,) misfit in units of the noise, then penalties; far away where the model fails."""
+        """(M,) misfit in units of the noise, then penalties; infinite where the model fails."""
         misfit = self.data.misfit(self.predicted(z))
         if self.penalty is not None:
             misfit = jnp.concatenate([misfit, ravel_pytree(self.penalty(self.space.params(z)))[0].astype(misfit.dtype)])
-        return jnp.where(jnp.all(jnp.isfinite(misfit)), misfit, FAR)
+        return jnp.where(jnp.all(jnp.isfinite(misfit)), misfit, jnp.inf)
 
 
 def _jacobian(residuals: Callable[[Array], Array], z: Array, reverse: bool) -> tuple[Array, Array]:
@@ -131,9 +127,9 @@ class Problem(eqx.Module):
         if not self.is_least_squares:
             # A first step along the gradient then has the length of one.
             slope = _gradient(converted, z)
-            return _Loss(converted, 1 / jnp.sqrt(jnp.maximum(jnp.linalg.norm(slope), _TINY)))
+            return _Loss(converted, 1 / jnp.sqrt(_or_one(jnp.linalg.norm(slope))))
         _, jacobian = jacobian_of(converted, z, self.reverse)
-        return _LeastSquares(converted, 1 / jnp.maximum(_DAMPING * jnp.linalg.norm(jacobian), _TINY), self.reverse)
+        return _LeastSquares(converted, 1 / _or_one(_DAMPING * jnp.linalg.norm(jacobian)), self.reverse)
 
     def profile(self, params: Any, name: str, values: np.ndarray, max_steps: int) -> np.ndarray:
         """(P,) the least losses with one parameter held at each of some values, from the optimum outwards."""
@@ -164,6 +160,11 @@ class Problem(eqx.Module):
             known[int(k)] = solution.value
             losses[k] = 0.5 * float(jnp.sum(solution.aux**2))
         return losses
+
+
+def _or_one(norm: Array) -> Array:
+    """A norm to scale by; one of a problem without slope."""
+    return jnp.where(norm == 0, 1.0, norm)
 
 
 @eqx.filter_jit
@@ -203,9 +204,9 @@ def prepare(
             f"Expected at least as many values as unknowns, found {num_residuals} for {z.size}. Observe more, fit "
             "fewer parameters, or add what is known as penalty= (ltl.smoothness, say)."
         )
-    solver, name = _method(method, z.size, rtol, atol)
+    solver, name = method_of(method, z.size, rtol, atol)
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
-        reverse = num_residuals < z.size
+        reverse = False
         how = f"its Jacobian in forward mode, {z.size} tangents beside each run"
         if not _goes_forward(plain, z):
             if num_residuals > MANY:
@@ -227,6 +228,11 @@ def forward_adjoint(model: Model) -> diffrax.AbstractAdjoint | None:
     return diffrax.ForwardMode() if takes_adjoint else None
 
 
+def steps_adaptively(model: Model) -> bool:
+    """Whether a model may take adaptive steps, as far as can be seen from outside."""
+    return model.dt is None if isinstance(model, Experiment) else forward_adjoint(model) is not None
+
+
 def _goes_forward(residuals: FitResiduals, z: Array) -> bool:
     try:
         # All tangents, not one: JAX notices a function that has reverse mode alone when it maps over tangents.
@@ -234,15 +240,3 @@ def _goes_forward(residuals: FitResiduals, z: Array) -> bool:
     except TypeError:  # what JAX says of functions that define reverse mode alone
         return False
     return True
-
-
-def _method(method: Any, size: int, rtol: float, atol: float) -> tuple[Any, str]:
-    if method is None:
-        if size <= MANY:
-            return optx.LevenbergMarquardt(rtol, atol), "Levenberg-Marquardt"
-        return optx.LBFGS(rtol, atol, history_length=20), "L-BFGS"
-    if isinstance(method, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        return method, type(method).__name__
-    if hasattr(method, "init") and hasattr(method, "update"):
-        return optx.OptaxMinimiser(method, rtol, atol), "optax"
-    raise ValueError(f"Expected a method of optimistix or optax, found {method!r}.")

@@ -31,6 +31,12 @@ class PatternStatistics(eqx.Module):
     coverage: Float[Array, " L"]
 
     @property
+    def histogram(self) -> Float[Array, " L1"]:
+        """(L + 1,) the shares of the surface below the first level, between one and the next, and above the last."""
+        ends = jnp.ones(1, self.coverage.dtype)
+        return -jnp.diff(jnp.concatenate([ends, self.coverage, 0 * ends]))
+
+    @property
     def vector(self) -> Float[Array, " N"]:
         """All of them in a row, for `Observations`."""
         return jnp.concatenate([jnp.stack([self.wavelength, self.mean, self.deviation, self.skewness]), self.coverage])
@@ -49,7 +55,7 @@ def pattern_statistics(
         surface: where.
         u: (V,) one species.
         mass: (V,) the measure, ``surface.mass`` (asked for outside jit).
-        levels: values above which the coverage is counted; by default the histogram's: none.
+        levels: ascending values above which the coverage is counted, and between which the histogram; by default none.
         softness: of the counting, as a share of the field's deviation: a step would have no derivatives.
     """
     u = jnp.asarray(u)

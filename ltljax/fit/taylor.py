@@ -21,9 +21,10 @@ class GradientCheck:
         steps: (K,) the lengths of the steps.
         remainders: (K,) |f(x + h d) - f(x) - h f'(x) d|, which falls like h^2 where the derivative is right.
         differences: (K,) |f(x + h d) - f(x)|, which falls like h.
-        slope: of the remainders, where rounding does not rule them; infinite for a linear function.
+        slope: of the remainders, where rounding does not rule them; infinite where nothing else is left of them.
         derivative: f'(x) d.
-        passed: whether the slope is within 0.1 of two or more.
+        passed: whether the slope is within 0.1 of two or more, or the differences stand above rounding and the
+            remainders do not.
         verdict: in words.
     """
 
@@ -41,6 +42,8 @@ class GradientCheck:
         table += [f"{h:10.1e} {difference:16.3e} {remainder:14.3e}" for h, difference, remainder in rows]
         return "\n".join([*table, self.verdict])
 
+    __repr__ = __str__
+
 
 def check_gradient(
     loss: Callable[[Any], Any], params: Any, direction: Any = None, step: float = 1e-2, seed: int = 0
@@ -49,7 +52,8 @@ def check_gradient(
 
     If the gradient is right the remainder of the linear prediction falls like the square of the step: slope 2. Slope 1
     says it is wrong (or the function has a kink there); no slope at all says that the loss is noisy, mostly because
-    adaptive steps or an iteration end at different places, which tighter tolerances cure.
+    adaptive steps or an iteration end at different places, which tighter tolerances cure. A loss that does not answer
+    to the steps beyond its rounding shows nothing, and does not pass.
 
     Args:
         loss: ``params -> number``, differentiable in reverse mode.
@@ -59,7 +63,7 @@ def check_gradient(
         seed: of the random direction.
 
     Returns:
-        The `GradientCheck`; print it.
+        The `GradientCheck`, which prints as the table and what is wrong.
 
     Raises:
         ValueError: the loss or its gradient is not finite, or no number.
@@ -90,13 +94,19 @@ def check_gradient(
     if usable[:3].all():
         last = int(np.argmin(usable)) if not usable.all() else len(steps)
         slope = float(np.polyfit(np.log(steps[:last]), np.log(remainders[:last]), 1)[0])
+    if np.isinf(slope) and max(remainders[0], rounding) > _NEARLY * differences[0]:
+        verdict = (
+            f"The loss does not answer to steps of this size: it changes by {differences[0]:.1g}, and the rounding of "
+            f"{first:.3g} may be {rounding:.1g}. Take a larger step=, float64, or a loss without the large constant."
+        )
+        return GradientCheck(steps, remainders, differences, slope, derivative, False, verdict)
     share = remainders[-1] / max(differences[-1], 1e-300)
     verdict = _verdict(slope, derivative, share)
     return GradientCheck(steps, remainders, differences, slope, derivative, slope > 1.9, verdict)
 
 
 def _verdict(slope: float, derivative: float, share: float) -> str:
-    if slope == float("inf"):
+    if np.isinf(slope):
         return "The gradient is right: nothing but rounding is left (the function is linear along this direction)."
     if slope > 1.9:
         return f"The gradient is right: slope {slope:.2f}."

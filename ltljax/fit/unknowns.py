@@ -16,6 +16,9 @@ from jaxtyping import Array, Float
 
 from ..tables import AnyArray
 
+# A parameter this near to an end of its range, as a share of it, has run there if it is to go on.
+_NEAR = 1e-3
+
 
 class Transform(eqx.Module):
     """The range of a parameter: a smooth map from all numbers onto it, and back."""
@@ -30,6 +33,10 @@ class Transform(eqx.Module):
 
     def admits(self, x: np.ndarray) -> bool:
         """Whether parameters are inside the range."""
+        raise NotImplementedError
+
+    def at_end(self, x: np.ndarray, wanted: np.ndarray, scale: float) -> np.ndarray:
+        """Which parameters have run to an end of the range, where values beyond it are wanted."""
         raise NotImplementedError
 
 
@@ -47,6 +54,11 @@ class Real(Transform):
     def admits(self, x):
         """Whether all are finite."""
         return bool(np.isfinite(x).all())
+
+    def at_end(self, x, wanted, scale):
+        """None of them."""
+        del wanted, scale
+        return np.zeros(np.shape(x), bool)
 
     def __str__(self):
         return "finite"
@@ -68,6 +80,10 @@ class Positive(Transform):
     def admits(self, x):
         """Whether all are positive."""
         return bool((np.isfinite(x) & (x > 0)).all())
+
+    def at_end(self, x, wanted, scale):
+        """Those next to zero."""
+        return (x < _NEAR * scale) & (wanted <= 0)
 
     def __str__(self):
         return "positive"
@@ -102,6 +118,12 @@ class Bounded(Transform):
     def admits(self, x):
         """Whether all are between the bounds."""
         return bool(((x > self.low) & (x < self.high)).all())
+
+    def at_end(self, x, wanted, scale):
+        """Those next to a bound."""
+        del scale
+        near = _NEAR * (self.high - self.low)
+        return ((x < self.low + near) & (wanted <= self.low)) | ((x > self.high - near) & (wanted >= self.high))
 
     def __str__(self):
         return f"between {self.low:g} and {self.high:g}"
@@ -138,6 +160,15 @@ class Unknowns(eqx.Module):
         """The derivative of every parameter with respect to its own entry."""
         _, slopes = jax.jvp(lambda z: ravel_pytree(self.params(z))[0], (z,), (jnp.ones_like(z),))
         return slopes
+
+    def at_end(self, params: Any, wanted: np.ndarray) -> np.ndarray:
+        """(n,) whether each parameter has run to an end of its range, where values (n,) beyond it are wanted."""
+        found, begin = [], 0
+        for leaf, transform, scale in zip(jax.tree.leaves(params), self.transforms, self.scales, strict=True):
+            x = np.ravel(np.asarray(leaf, np.float64))
+            found.append(transform.at_end(x, wanted[begin : begin + x.size], float(scale)))
+            begin += x.size
+        return np.concatenate(found)
 
 
 def unknowns(start: Any, transforms: Any = None) -> Unknowns:

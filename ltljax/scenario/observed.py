@@ -145,7 +145,7 @@ def _npz(path: Path) -> dict[str, Any]:
 
 
 def _csv(path: Path) -> dict[str, Any]:
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_text(encoding="utf-8-sig").splitlines()  # spreadsheets begin with a mark
     names = [name.strip() for name in lines[0].split(",")]
     values = np.array([[float(entry) for entry in line.split(",")] for line in lines[1:] if line.strip()])
     if values.ndim != 2 or values.shape[1] != len(names):
@@ -154,7 +154,8 @@ def _csv(path: Path) -> dict[str, Any]:
 
 
 def _ply(path: Path) -> dict[str, Any]:
-    return {name: values for name, values in vertex_properties(path.read_bytes()).items() if name not in "xyz"}
+    positions = {"x", "y", "z"}
+    return {name: values for name, values in vertex_properties(path.read_bytes()).items() if name not in positions}
 
 
 def _vtp(path: Path) -> dict[str, Any]:
