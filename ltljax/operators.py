@@ -276,7 +276,8 @@ def growth_rate(surface: Surface) -> float:
     """
     matrix: Any = laplacian_matrix(surface)
     if surface.num_vertices <= _DENSE:
-        return float(np.linalg.eigvals(matrix.todense()).real.max())
+        values: Any = np.linalg.eigvals(matrix.todense())
+        return float(values.real.max())
     start = np.random.default_rng(0).normal(size=surface.num_vertices)
     try:
         options: Any = dict(ncv=40, maxiter=100, tol=1e-2, v0=start)

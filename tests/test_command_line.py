@@ -263,7 +263,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
     with monkeypatch.context() as patched:
         patched.setattr(sys.modules["ltljax.run"], "solve", interrupted)
         assert main(pieces) == 130
-    assert (tmp_path / "pieces" / "restart" / "progress.json").exists()
+    assert (tmp_path / "pieces" / "restart" / "run.json").exists()
     capsys.readouterr()
     code, error = fails(capsys, *pieces, "--resume", "--seed", "5")
     assert code == 2

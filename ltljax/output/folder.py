@@ -69,7 +69,7 @@ def _copy(key: str, file: Path) -> str:
 
 def _is_of_a_run(out: Path) -> bool:
     """Whether a run has written to a folder, or was interrupted there."""
-    if (out / "restart" / "progress.json").exists():
+    if (out / "restart" / "run.json").exists():
         return True
     try:
         found = json.loads((out / "summary.json").read_text(encoding="utf-8"))

@@ -49,7 +49,8 @@ def bake(uv: np.ndarray | None, faces: np.ndarray, values: np.ndarray, size: int
             "map is tiled: unwrap the mesh anew, without repetition."
         )
     # What lies far outside is repeated, so whole turns may be left out.
-    uv = uv - np.floor(uv.min(axis=1, keepdims=True))
+    turns: np.ndarray = np.floor(uv.min(axis=1, keepdims=True))
+    uv = uv - turns
     # Pixel centres lie at whole numbers.
     corners = uv * [size, -size] + [-0.5, size - 0.5]
     low = np.ceil(corners.min(axis=1)).astype(int)
