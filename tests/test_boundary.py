@@ -157,6 +157,7 @@ def test_species_have_data_of_their_own():
     np.testing.assert_allclose(u, np.broadcast_to([1.0, 3.0], u.shape), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_data_can_be_differentiated():
     surface, r, _ = disk(6)
 

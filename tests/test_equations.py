@@ -174,6 +174,7 @@ def _unit(x):
     return x / jnp.linalg.norm(x)
 
 
+@pytest.mark.slow
 def test_the_evolving_ellipsoid_is_solved_at_order_two():
     errors = [evolving_ellipsoid(level) for level in (2, 3)]
     assert np.log2(errors[0] / errors[1]) > 1.8

@@ -55,7 +55,12 @@ def relative(found, truth):
 
 @pytest.mark.parametrize(
     "method",
-    [None, optx.Dogleg(1e-6, 1e-8), optx.BFGS(1e-7, 1e-9), optx.LBFGS(1e-7, 1e-9)],
+    [
+        None,
+        optx.Dogleg(1e-6, 1e-8),
+        optx.LBFGS(1e-7, 1e-9),
+        pytest.param(optx.BFGS(1e-7, 1e-9), marks=pytest.mark.slow),
+    ],
     ids=lambda m: type(m).__name__,
 )
 def test_rates_are_recovered_from_clean_snapshots(rates, method):
@@ -347,6 +352,7 @@ def test_a_discrepancy_that_no_weight_reaches_is_said_to_be_missed():
     assert weight == 0.1
 
 
+@pytest.mark.slow
 def test_the_l_curve_bends_at_a_good_weight():
     rng = np.random.default_rng(0)
     t = np.linspace(0, 1, 60)
@@ -627,7 +633,7 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), transforms=dict(c=ltl.Positive()))
     with pytest.raises(ValueError, match="to be a float"):
         ltl.fit(experiment, {**AWAY, "a": 1}, ltl.Observations(clean, times=TIMES))
-    with pytest.raises(ValueError, match="method of optimistix .* or an optimiser of optax, found 'lm'"):
+    with pytest.raises(ValueError, match=r"method of optimistix .* or an optimiser of optax, found 'lm'"):
         ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), method="lm")
     with pytest.raises(ValueError, match="low < high"):
         ltl.Bounded(1.0, 1.0)

@@ -376,6 +376,7 @@ def test_a_stationary_state_has_the_boundary_data_of_its_time(reacts):
     np.testing.assert_allclose(jax.grad(total)(1.0), jnp.sum(at_2), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_marching_to_a_stationary_state_has_derivatives_in_both_modes(sphere):
     def logistic(species, p):
         return (p * species[0] - species[0] ** 2,)

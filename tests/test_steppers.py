@@ -260,7 +260,7 @@ def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name
         assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
 
 
-@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("name", ["RKL2", *(pytest.param(n, marks=pytest.mark.slow) for n in GRADIENTS if n != "RKL2")])
 def test_the_direct_adjoint_has_the_derivatives_of_checkpoints(sphere, name):
     solver, how = GRADIENTS[name]
     x1 = sphere.vertices[:, 0]
