@@ -639,7 +639,7 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         ltl.Bounded(1.0, 1.0)
     with pytest.raises(ValueError, match="has but one"):
         ltl.fit(lambda p: p * bumpy(sphere), 1.0, ltl.Observations(bumpy(sphere), species=0))
-    with pytest.raises(ValueError, match=r"nan at index \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"nan at index \(0, 1\)"):
         ltl.fit_many(
             lambda p: p * jnp.ones(3), 1.0, ltl.Observations(np.ones(3)), values=np.where(np.eye(2, 3, 1), np.nan, 1.0)
         )
