@@ -208,3 +208,12 @@ def test_a_state_that_does_not_fit_is_refused(sphere):
     equation = ltl.ReactionDiffusion((1.0, 1.0), ltl.kinetics.gray_scott())
     with pytest.raises(ValueError, match="one column for each diffusivity"):
         ltl.solve(equation, sphere, jnp.zeros((sphere.num_vertices, 3)), 1.0)
+
+
+def test_gradients_are_finite_where_nothing_diffuses():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    x1 = surface.vertices[:, 0]
+    energy = lambda d: jnp.mean(ltl.solve(ltl.Diffusion(d), surface, x1, 0.1).u_end ** 2)  # noqa: E731
+    # u decays like exp(-lambda d t), with lambda near 2.
+    rate = -jnp.mean(x1 * ltl.laplacian(surface, x1)) / jnp.mean(x1**2)
+    assert jax.grad(energy)(0.0) == pytest.approx(float(-2 * rate * 0.1 * jnp.mean(x1**2)), rel=1e-3)

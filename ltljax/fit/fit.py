@@ -47,7 +47,7 @@ class Fit:
         params: the parameters, as the start was given.
         losses: (steps,) half the sum of squared residuals after every step, the start's first.
         reason: why it stopped, in words.
-        converged: whether it stopped because the parameters and residuals no longer changed.
+        converged: whether it stopped because the parameters or the loss no longer changed, or no step lowers the loss.
         num_steps: of the method, rejected ones with them: each a run of the model, with derivatives in a least-squares
             method, and in others where it was accepted.
         method: the method, and how derivatives were taken.

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import diffrax
@@ -110,7 +109,7 @@ class Scenario:
     frames: int = 60
     settings: Settings = Settings()
     resolved: dict[str, Any] | None = None
-    files: Mapping[str, Path] = MappingProxyType({})
+    files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
     wanted: Wanted | None = None
 
 

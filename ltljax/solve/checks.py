@@ -53,7 +53,7 @@ def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
 def tolerances(rtol: ArrayLike, atol: ArrayLike) -> None:
     """Raise where tolerances are not positive."""
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
-        if not isinstance(tolerance, Tracer) and not (np.isfinite(tolerance) and np.all(np.asarray(tolerance) > 0)):
+        if not isinstance(tolerance, Tracer) and not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) > 0)):
             raise ValueError(
                 f"Expected a positive tolerance, found {name} = {tolerance}: steps would have to be without error. For "
                 "steps of a length of your own give dt."

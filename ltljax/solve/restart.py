@@ -52,6 +52,8 @@ def _feed(update: Callable[[bytes], None], value: Any, seen: dict[int, Any]) -> 
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         tell(repr(value))
         return
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        value = jax.random.key_data(value)
     if isinstance(value, np.ndarray | jax.Array | np.generic):
         array = np.asarray(value)
         tell(f"{array.dtype}{array.shape}")

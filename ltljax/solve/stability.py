@@ -64,10 +64,10 @@ class Dispersion(eqx.Module):
         return half + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
     def frequency(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "..."]:
-        """The angular frequency at which the mode that grows fastest oscillates: zero where it does not."""
-        values = jnp.linalg.eigvals(self._matrices(eigenvalue))
-        leading = jnp.argmax(values.real, axis=-1, keepdims=True)
-        return jnp.abs(jnp.take_along_axis(values.imag, leading, axis=-1))[..., 0]
+        """The angular frequency at which the mode that grows fastest oscillates: zero where it does not (host)."""
+        values = np.linalg.eigvals(np.asarray(self._matrices(eigenvalue)))
+        leading = np.argmax(values.real, axis=-1, keepdims=True)
+        return jnp.asarray(np.abs(np.take_along_axis(values.imag, leading, axis=-1))[..., 0], self.jacobian.dtype)
 
     @functools.cached_property
     def band(self) -> tuple[float, float] | None:
@@ -110,7 +110,8 @@ class Dispersion(eqx.Module):
 
     @property
     def _rounding(self) -> float:
-        return _ROUNDING * float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
+        rounding = max(_ROUNDING, 8 * float(jnp.finfo(self.jacobian.dtype).eps))
+        return rounding * float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
 
     def _matrices(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "... S S"]:
         eigenvalue = jnp.asarray(eigenvalue, self.jacobian.dtype)
