@@ -1,7 +1,12 @@
-"""A self-check of the backend: some releases of jaxlib return wrong results for jit(vmap(...)) of padded gathers.
+"""A self-check of the backend: some releases of jaxlib return wrong results for jit(vmap(...)), or none.
 
-jax-ml/jax#39103: jaxlib 0.10.2 on CPU, silently. The releases known to do so are excluded in pyproject.toml.
+jax-ml/jax#39103: wrong results for padded gathers, jaxlib 0.10.2 on CPU, silently; the releases known to do so are
+excluded in pyproject.toml. Batched fits that never end: jaxlib 0.10.1.
 """
+
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -52,3 +57,17 @@ def test_the_jacobian_is_the_matrix(case):
     for jacobian in (jax.jacfwd, jax.jacrev):
         found = jax.jit(jacobian(lambda u: ltl.laplacian(surface, u)))(u)
         assert_equal(found, matrix.todense(), surface)
+
+
+def test_batched_fits_end():
+    """At the size at which jaxlib 0.10.1 waits for ever under its default schedule; in a process that can be stopped."""
+    program = """
+import jax.numpy as jnp, numpy as np, ltljax as ltl
+x = np.linspace(0, 3, 3855)
+model = lambda p: jnp.sin(p["a"] * x) + p["b"] * x + jnp.exp(-p["d"] * x)
+truth = dict(a=1.0, b=2.0, d=0.5)
+starts = {key: value * np.linspace(0.8, 1.2, 8) for key, value in truth.items()}
+found = ltl.fit_many(model, starts, ltl.Observations(np.asarray(model(truth)), 0.1), transforms=ltl.Positive())
+assert found.losses.max() < 1e-3, found.losses
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=100, env=os.environ | {"JAX_ENABLE_X64": "1"})

@@ -103,8 +103,20 @@ def fit_many(
     along = z if many is None else many
     # With the arrays it reads as leaves: as constants of the program they would be folded, slowly.
     converted = eqx.filter_closure_convert(whole, along[0])
-    mapped = eqx.filter_jit(eqx.filter_vmap(lambda converted, one: converted(one), in_axes=(None, 0)))
-    return ManyFits(*mapped(converted, along))
+    arrays, rest = eqx.partition(converted, eqx.is_array)
+    mapped = jax.jit(
+        jax.vmap(lambda arrays, one: eqx.combine(arrays, rest)(one), in_axes=(None, 0)), compiler_options=_options()
+    )
+    return ManyFits(*mapped(arrays, along))
+
+
+def _options() -> dict[str, str] | None:
+    """What keeps a batch of Levenberg-Marquardt steps from never ending on CPU with jax before 0.12.
+
+    The scheduler that lets independent operations run side by side then waits for ever, at some sizes (8 fits of 3855
+    residuals with jaxlib 0.10.1); tests/test_backend.py watches for it.
+    """
+    return {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"} if jax.__version_info__ < (0, 12) else None
 
 
 def explore(
