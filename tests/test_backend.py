@@ -60,7 +60,7 @@ def test_the_jacobian_is_the_matrix(case):
 
 
 def test_batched_fits_end():
-    """At the size at which jaxlib 0.10.1 waits for ever under its default schedule; in a process that can be stopped."""
+    """At the size at which jaxlib 0.10.1 waits for ever under its default schedule; in a process that can be ended."""
     program = """
 import jax.numpy as jnp, numpy as np, ltljax as ltl
 x = np.linspace(0, 3, 3855)

@@ -12,6 +12,7 @@ from jax.test_util import check_grads
 from scipy.special import jn_zeros
 
 import ltljax as ltl
+from ltljax.solve import stationary
 from ltljax.solve.implicit import Preconditioning
 from ltljax.solve.krylov import linear_solve
 
@@ -70,6 +71,14 @@ def test_the_cycle_for_the_transpose_is_the_transposed_cycle(sphere):
     np.testing.assert_allclose(forth, back, rtol=1e-10)
 
 
+@pytest.fixture(params=["factor", "multigrid"])
+def way(request, monkeypatch):
+    """How `poisson` solves its systems."""
+    if request.param == "multigrid":
+        monkeypatch.setattr(stationary, "_FACTORISED", 0)
+    return request.param
+
+
 def test_poisson_is_of_second_order_and_leaves_no_residual():
     errors = []
     for level in (3, 4):
@@ -87,7 +96,7 @@ def test_poisson_is_of_second_order_and_leaves_no_residual():
 
 
 @pytest.mark.parametrize("kind", MESHES)
-def test_poisson_leaves_no_residual_on_any_mesh(kind):
+def test_poisson_leaves_no_residual_on_any_mesh(kind, way):
     surface = ltl.Surface.from_mesh(MESHES[kind](2500))
     f = jnp.sin(3 * surface.vertices[:, 0]) + surface.vertices[:, 2]
     f = f - ltl.integrate(surface, f, surface.mass) / jnp.sum(surface.mass)
@@ -97,11 +106,12 @@ def test_poisson_leaves_no_residual_on_any_mesh(kind):
     assert jnp.linalg.norm(ltl.laplacian(surface, found) - f) < 1e-10 * jnp.linalg.norm(f)
 
 
-def test_high_order_is_solved_with_the_multigrid_of_monotone():
+def test_high_order_is_solved_with_the_multigrid_of_monotone_and_by_a_factor():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4), ltl.Polynomial(degree=4))
     u = surface.vertices.prod(axis=1)
-    found = ltl.screened_poisson(surface, -13 * u)
-    assert jnp.linalg.norm(found - u) < 5e-5 * jnp.linalg.norm(u)
+    for inverse in (ltl.multigrid(surface), ltl.factorized(surface, 1.0)):
+        found = ltl.screened_poisson(surface, -13 * u, preconditioner=inverse)
+        assert jnp.linalg.norm(found - u) < 5e-5 * jnp.linalg.norm(u)
 
 
 @pytest.mark.parametrize(("kind", "better"), [("jittered", 40), ("random", 8)])
@@ -109,7 +119,7 @@ def test_high_order_on_irregular_meshes_takes_few_iterations_and_is_far_ahead(ki
     mesh = MESHES[kind](2500)
     surface = ltl.Surface.from_mesh(mesh, ltl.Polynomial(degree=4))
     u = surface.vertices.prod(axis=1)
-    found = ltl.screened_poisson(surface, -13 * u)
+    found = ltl.screened_poisson(surface, -13 * u, preconditioner=ltl.multigrid(surface))
     error = float(jnp.linalg.norm(found - u) / jnp.linalg.norm(u))
     # Of linear finite elements on intrinsic Delaunay triangles.
     stiffness, masses = robust_laplacian.mesh_laplacian(mesh.vertices, mesh.faces)
@@ -127,7 +137,7 @@ def test_a_right_side_with_a_mean_is_said(sphere):
     np.testing.assert_allclose(shifted, ltl.poisson(sphere, x1), atol=1e-8)
 
 
-def test_every_component_has_its_own_mean():
+def test_every_component_has_its_own_mean(way):
     one = ltl.shapes.icosphere(2)
     surface = ltl.Surface.from_mesh(two_spheres(2))
     x1 = jnp.asarray(np.tile(one.vertices[:, 0], 2) * np.repeat([1.0, 3.0], one.num_vertices))
@@ -171,26 +181,79 @@ def test_what_discretisation_leaves_of_no_mean_is_not_said(kind):
 @pytest.mark.parametrize(
     "condition", [ltl.Dirichlet(1.0), ltl.Robin(1.0, 1.0, 3.0), (ltl.Neumann(2.0), ltl.Dirichlet(1.0, where=0))]
 )
-def test_poisson_on_a_disk_keeps_its_conditions(condition):
+def test_poisson_on_a_disk_keeps_its_conditions(condition, way):
     surface = ltl.Surface.from_mesh(ltl.shapes.disk())
     squared = jnp.sum(surface.vertices**2, axis=1)
     np.testing.assert_allclose(ltl.poisson(surface, 0 * squared + 4, condition), squared, atol=1e-8)
 
 
-def test_poisson_is_differentiated_in_both_modes(sphere):
+def test_poisson_is_differentiated_in_both_modes(sphere, way):
     x = sphere.vertices
     f = jnp.cos(2 * x[:, 0])
     f = f - ltl.integrate(sphere, f, sphere.mass) / jnp.sum(sphere.mass)
     check_grads(lambda f: jnp.sin(ltl.poisson(sphere, f)), (f,), order=1, modes=("fwd", "rev"), rtol=1e-5, atol=1e-5)
-    hierarchy = ltl.multigrid(sphere)
+    inverse = ltl.multigrid(sphere) if way == "multigrid" else ltl.factorized(sphere, 1.0)
 
     @jax.jit
     def energy(stretch):
         moved = sphere.with_vertices(x * (1 + stretch * x[:, :1]))
-        return jnp.sum(ltl.screened_poisson(moved, f, preconditioner=hierarchy) ** 2)
+        return jnp.sum(ltl.screened_poisson(moved, f, preconditioner=inverse) ** 2)
 
     slope = (energy(0.1 + 1e-4) - energy(0.1 - 1e-4)) / 2e-4
     np.testing.assert_allclose(jax.grad(energy)(0.1), slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scheme", [ltl.Monotone(), ltl.Polynomial(degree=4)], ids=["Monotone", "Polynomial"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+def test_a_factor_is_the_inverse_and_its_transpose(scheme, dtype):
+    surface = ltl.Surface.from_mesh(two_spheres(2), scheme, dtype)
+    matrix = ltl.laplacian_matrix(surface).todense()
+    areas = np.asarray(surface.vertex_areas)
+    components = np.asarray(surface.topology.components)
+    r = jnp.asarray(np.random.default_rng(0).normal(size=(surface.num_vertices, 2)), dtype)
+    eps = float(jnp.finfo(dtype).eps)
+    for screening in (0.0, 0.7):
+        inverse = ltl.factorized(surface, screening)
+        whole = screening * np.eye(len(areas)) - matrix
+        if screening == 0:  # the means over components are moved to the smallest eigenvalue
+            same = components[:, None] == components[None]
+            whole = whole + inverse.smallest * same * areas / (same @ areas)[:, None]
+        for transposed in (False, True):
+            found = inverse(r, transposed)
+            assert found.dtype == dtype
+            again = (whole.T if transposed else whole) @ np.asarray(found, np.float64)
+            np.testing.assert_allclose(again, r, atol=1e4 * eps)
+            one_by_one = jnp.stack([inverse(r[:, k], transposed) for k in range(2)], axis=1)
+            np.testing.assert_allclose(one_by_one, found, atol=1e3 * eps)
+            batch = jax.jit(jax.vmap(lambda r, t=transposed, inverse=inverse: inverse(r, t)))(jnp.stack([r, 2 * r]))
+            np.testing.assert_allclose(batch, jnp.stack([found, 2 * found]), atol=1e3 * eps)
+
+
+def test_a_factor_ends_the_iteration_at_once_and_one_that_is_off_still_helps(sphere, monkeypatch):
+    counts = []
+    solved = stationary._stationary
+
+    def counting(*args):
+        out = solved(*args)
+        counts.append(int(out[-1]))
+        return out
+
+    monkeypatch.setattr(stationary, "_stationary", counting)
+    f = jnp.sin(3 * sphere.vertices[:, 0])
+    ltl.screened_poisson(sphere, f)
+    ltl.screened_poisson(sphere, f, 1 + sphere.vertices[:, 0] ** 2, preconditioner=ltl.factorized(sphere, 1.0))
+    ltl.poisson(sphere, sphere.vertices[:, 0])
+    assert counts[0] == counts[2] == 1
+    assert 1 < counts[1] < 8
+
+
+def test_a_factor_says_what_it_cannot_do(sphere):
+    with pytest.raises(ValueError, match="nowhere negative, found -1"):
+        ltl.factorized(sphere, -1.0)
+    with pytest.raises(ValueError, match="vanish on more than constants"):
+        ltl.factorized(ltl.Surface.from_mesh(ltl.shapes.icosphere(2), ltl.Paper()))
+    with pytest.raises(ValueError, match="being traced"):
+        jax.jit(lambda x: ltl.factorized(sphere.with_vertices(x)).smallest)(sphere.vertices)
 
 
 def test_heat_with_a_source_reaches_its_stationary_state_both_ways():

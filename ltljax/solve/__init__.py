@@ -1,6 +1,7 @@
 """How it is solved: time stepping through diffrax, the steppers diffrax lacks, linear systems,
 multigrid, eigenmodes, and what linear theory says before a run."""
 
+from .direct import Factorized, factorized
 from .distance import geodesic_distance
 from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
@@ -21,6 +22,7 @@ __all__ = [
     "Dispersion",
     "Eigenmodes",
     "Explanation",
+    "Factorized",
     "GrowingModesWarning",
     "IncompatibleSourceWarning",
     "Multigrid",
@@ -31,6 +33,7 @@ __all__ = [
     "dispersion",
     "eigenmodes",
     "explain",
+    "factorized",
     "geodesic_distance",
     "multigrid",
     "poisson",

@@ -331,8 +331,14 @@ def _choice(
 
 def hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) -> Multigrid | None:
     """The multigrid of the surface under the equation's conditions, where it can be had."""
-    if surface.is_traced or not is_available():
-        return None
+    fixed = None if surface.is_traced or not is_available() else what_is_fixed(equation, surface, u0, t0)
+    return None if fixed is None else multigrid(surface, *fixed)
+
+
+def what_is_fixed(
+    equation: Equation, surface: Surface, u0: Array, t0: ArrayLike
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """What conditions absorb and which vertices they hold (host); None where that is being traced."""
     time = jnp.asarray(t0, surface.dtype)
     conditions = equation.conditions
     is_held = bounds.held_vertices(surface, conditions)
@@ -340,8 +346,8 @@ def hierarchy(equation: Equation, surface: Surface, u0: Array, t0: ArrayLike) ->
     if isinstance(is_held, Tracer):
         return None
     # Where the data of conditions are being traced their absorption is left out: a preconditioner may be off.
-    absorption = None if isinstance(absorption, Tracer) else np.maximum(np.asarray(absorption), 0)
-    return multigrid(surface, absorption, np.asarray(is_held))
+    absorption = np.zeros(len(is_held)) if isinstance(absorption, Tracer) else np.maximum(np.asarray(absorption), 0)
+    return absorption, np.asarray(is_held)
 
 
 def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.ndarray | None:

@@ -66,8 +66,8 @@ class Dispersion(eqx.Module):
     def frequency(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "..."]:
         """The angular frequency at which the mode that grows fastest oscillates: zero where it does not (host)."""
         values = np.linalg.eigvals(np.asarray(self._matrices(eigenvalue)))
-        leading = np.argmax(values.real, axis=-1, keepdims=True)
-        return jnp.asarray(np.abs(np.take_along_axis(values.imag, leading, axis=-1))[..., 0], self.jacobian.dtype)
+        leading = np.argmax(np.real(values), axis=-1, keepdims=True)
+        return jnp.asarray(np.abs(np.take_along_axis(np.imag(values), leading, axis=-1))[..., 0], self.jacobian.dtype)
 
     @functools.cached_property
     def band(self) -> tuple[float, float] | None:

@@ -18,12 +18,13 @@ from jaxtyping import Array, Float
 
 from ..equations import Diffusion, Equation
 from ..equations import boundary as bounds
-from ..lifting.schemes import Monotone
+from ..lifting.schemes import Monotone, Paper
 from ..operators import spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
 from . import checks
-from .evolve import SolveError, Steady, hierarchy, solve
+from .direct import Factorized, factor
+from .evolve import SolveError, Steady, hierarchy, solve, what_is_fixed
 from .implicit import Preconditioning
 from .krylov import GMRES, linear_solve
 from .multigrid import Multigrid
@@ -36,6 +37,8 @@ _DISCRETE = 4 * np.pi
 _MAX_MARCH = 500
 _MAX_NEWTON = 5
 _GROWN = 1e6
+# Vertices up to which elimination is faster than iteration, on CPU.
+_FACTORISED = 50_000
 # Of the steps in time towards a stationary state, in units of the reaction's time.
 _LONGEST = 1e4
 
@@ -50,7 +53,7 @@ def poisson(
     boundary: bounds.Conditions | None = None,
     *,
     tolerance: float | None = None,
-    preconditioner: Multigrid | None = None,
+    preconditioner: Multigrid | Factorized | None = None,
     throw: bool = True,
 ) -> Float[Array, "V *S"]:
     """The solution of Delta u = f: second order with ``Monotone``, fourth with ``Polynomial(degree=4)``.
@@ -60,16 +63,18 @@ def poisson(
     more than discretisation makes of none (``4 pi`` over the number of vertices, of the size of f, or a hundredth), and
     the u whose mean (in the vertex areas) is zero is returned.
 
-    By Krylov iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by
-    multigrid (the extra `amg`; otherwise by Jacobi's method, which takes many more iterations), and differentiable in
-    f, the data of the conditions and, with a ``preconditioner``, the vertices.
+    On CPU and up to 50,000 vertices by a factor of the matrix, made once for a surface (`factorized`). Otherwise by
+    Krylov iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by
+    multigrid (the extra `amg`; without it by Jacobi's method, which takes many more iterations). Differentiable in f,
+    the data of the conditions and, with a ``preconditioner``, the vertices.
 
     Args:
         surface: the surface.
         f: (V,) or (V, S).
         boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivative vanishes.
         tolerance: of the residual, relative to f; by default 1e-10 for float64 and 1e-5 for float32.
-        preconditioner: what `multigrid` returned for this surface or a similar one, where the surface is being traced.
+        preconditioner: what `multigrid` or `factorized` returned for this surface or a similar one, where the surface
+            is being traced.
         throw: whether to raise when the iteration does not converge. Inside jit nothing can be raised.
 
     Raises:
@@ -89,7 +94,7 @@ def screened_poisson(
     boundary: bounds.Conditions | None = None,
     *,
     tolerance: float | None = None,
-    preconditioner: Multigrid | None = None,
+    preconditioner: Multigrid | Factorized | None = None,
     throw: bool = True,
 ) -> Float[Array, "V *S"]:
     """The solution of Delta u - c u = f for a screening c > 0, a number or (V,): see `poisson`."""
@@ -106,7 +111,7 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
     if not isinstance(f, Tracer) and not np.isfinite(np.asarray(f)).all():
         raise ValueError(f"The right side is not finite at vertex {np.argwhere(~np.isfinite(np.asarray(f)))[0][0]}.")
     equation = Diffusion(1.0, source=-f, boundary=() if boundary is None else boundary)
-    preconditioner = hierarchy(equation, surface, f, 0.0) if preconditioner is None else preconditioner
+    preconditioner = _inverse(equation, surface, f, screening) if preconditioner is None else preconditioner
     tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
     screening = jnp.broadcast_to(jnp.asarray(screening, f.dtype), f.shape[:1])
     start = jnp.zeros_like(f)
@@ -125,6 +130,18 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
     return u
 
 
+def _inverse(equation: Diffusion, surface: Surface, f: Array, screening: Any) -> Multigrid | Factorized | None:
+    """A factor of a small system on CPU, else multigrid: benchmarks/direct.md."""
+    is_small = surface.num_vertices <= _FACTORISED and jax.default_backend() == "cpu"
+    if not is_small or surface.is_traced or isinstance(screening, Tracer) or isinstance(surface.scheme, Paper):
+        return hierarchy(equation, surface, f, 0.0)
+    fixed = what_is_fixed(equation, surface, f, 0.0)
+    if fixed is None:
+        return None
+    absorption, is_held = fixed
+    return factor(surface, np.asarray(screening, np.float64) + absorption, is_held)
+
+
 def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, float] | None:
     """The largest of the means (one for each component and column) that are more than discretisation leaves, in words,
     and as a share of what has it; None if there is none."""
@@ -141,15 +158,15 @@ def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, floa
     return said, float(share[at])
 
 
-def _unconverged(steps: int, preconditioner: Multigrid | None) -> str:
+def _unconverged(steps: int, preconditioner: Multigrid | Factorized | None) -> str:
     cure = 'Install the extra "amg" for multigrid' if preconditioner is None else "Raise the tolerance, or use float64"
     return f"The linear system was not solved within {steps} iterations. {cure}."
 
 
 @eqx.filter_jit
 def _stationary(
-    equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array, multigrid: Multigrid | None,
-    tolerance: Any,
+    equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array,
+    multigrid: Multigrid | Factorized | None, tolerance: Any,
 ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes) for
     every component and column, whether it was found, and in how many iterations."""
@@ -221,7 +238,7 @@ def steady_state(
     t: float = 0.0,
     tolerance: float = 1e-8,
     t1: float = 1e4,
-    preconditioner: Multigrid | None = None,
+    preconditioner: Multigrid | Factorized | None = None,
     throw: bool = True,
 ) -> Float[Array, "V *S"]:
     """A state at which the rate of an equation vanishes.
@@ -241,7 +258,8 @@ def steady_state(
         t: the time at which sources and boundary data are taken.
         tolerance: of the root mean square of the rate, relative to that of the state, per unit of time.
         t1: of ``"marching"``, the time not to run beyond.
-        preconditioner: what `multigrid` returned for this surface or a similar one, where the surface is being traced.
+        preconditioner: what `multigrid` (or, for `Diffusion`, `factorized`) returned for this surface or a similar one,
+            where the surface is being traced.
         throw: whether to raise when no such state is found. Inside jit nothing can be raised.
 
     Raises:
