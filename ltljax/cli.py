@@ -215,6 +215,7 @@ def _fit(options: argparse.Namespace) -> int:
         example,
         scheme=_scheme(example.settings.scheme, example.settings.degree),
         out=options.out,
+        inputs=(path, *([mesh_file] if mesh_file else [])),
         resume=options.resume,
     )
     return 0

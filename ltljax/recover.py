@@ -5,6 +5,7 @@ What enters: a `Scenario`. What leaves: a folder with a report, a picture, and t
 
 import json
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from .scenario import Scenario
 from .surface import Surface
 
 
-def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = False) -> Fit:
+def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Path] = (), resume: bool = False) -> Fit:
     """Fit the numbers that a scenario leaves free, and write what was found.
 
     In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
@@ -29,10 +30,12 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = Fals
         example: the scenario.
         scheme: of the operators.
         out: the folder to write to; made if absent.
+        inputs: files that are read beside those the scenario names, and must not be replaced.
         resume: whether to begin with what an interrupted fit of the same data left there.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.
+        OutputError: the results would replace one of the files that are read, or one that no fit has written.
         RestartError: what is there was left by another fit.
         FitError: the run fails at the first guess.
     """
@@ -42,6 +45,9 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, resume: bool = Fals
             f"{example.name} has no table [fit]: name the numbers to find as free = [...] and files of data as "
             "[[fit.data]] with file and time."
         )
+    from .output import folder
+
+    folder.check_fit_folder(out, (*inputs, *example.files.values(), *wanted.files))
     out.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(record=True) as cautions:
         warnings.simplefilter("always")

@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "show": {"mesh", "surface", "solve", "tables", "output"},
     "scenario": {"formulas", "mesh", "lifting", "elliptic", "equations", "operators", "surface", "solve", "output"},
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
-    "recover": {"scenario", "fit", "lifting", "surface"},
+    "recover": {"scenario", "fit", "lifting", "surface", "output"},
     "cli": {"scenario", "run", "recover", "fit", "mesh", "lifting", "solve"},
 }
 NO_JAX = ["mesh", "output", "lifting/support.py", "conservation.py", "progress.py"]

@@ -482,6 +482,21 @@ def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_
     assert not (tmp_path / "out" / "unknowns.npz").exists()
 
 
+def test_a_fit_replaces_nothing_that_no_fit_has_written(seen, tmp_path, capsys):
+    mesh, states = seen
+    for name, state in zip(("early", "late"), states, strict=True):
+        keep("npz", tmp_path, name, state, mesh)
+    (tmp_path / "fitted.toml").write_text(PLAIN.replace("rate = 30.0", "rate = 30.0\na = 0.13") + SOUGHT)
+    before = (tmp_path / "fitted.toml").read_text()
+    assert main(["fit", str(tmp_path / "fitted.toml"), "--out", str(tmp_path)]) == 2
+    assert "which the run reads" in capsys.readouterr().err
+    assert (tmp_path / "fitted.toml").read_text() == before
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fit.json").write_text('{"of": "another program"}')
+    assert main(["fit", str(tmp_path / "fitted.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert "fit.json, which no fit has written" in capsys.readouterr().err
+
+
 BROKEN_FITS = {
     "free unknown": ('"kinetics.a"', '"kinetics.zeta"', "fit.free"),
     "free twice": ('"kinetics.a", "diffusivity.v"', '"kinetics.a", "kinetics.a"', "each once"),
@@ -523,6 +538,15 @@ def test_a_broken_fit_is_one_clear_line(name, seen, tmp_path, capsys):
     assert said.err.count("\n") == 1
     assert message in said.err
     assert not (tmp_path / "out").exists()
+
+
+def test_data_that_memory_would_not_hold_are_refused_unread(seen, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(observed, "_LARGEST", 1000)
+    for name, state in zip(("early", "late"), seen[1], strict=True):
+        keep("npz", tmp_path, name, state, seen[0])
+    (tmp_path / "mine.toml").write_text(PLAIN + SOUGHT)
+    assert main(["fit", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert "expected arrays of at most 1000 bytes, found 2848" in capsys.readouterr().err
 
 
 def test_a_file_without_data_says_what_to_add(tmp_path, capsys):

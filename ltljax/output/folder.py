@@ -36,13 +36,34 @@ def check_folder(out: Path, name: str, inputs: Iterable[Path], copies: Mapping[s
     there = [path for path in (out / result for result in results) if path.exists()]
     there += sorted((out / "series").glob(f"{name}_*.vtp"))
     targets = {out / _copy(key, file): file for key, file in copies.items()}
-    read = [path for path in inputs if path.exists()]
-    for path in [*there, *targets]:
-        replaced = [file for file in read if path.exists() and path.samefile(file)]
-        if replaced and not (path in targets and path.samefile(targets[path])):
-            raise OutputError(f"The results in {out} would replace {path}, which the run reads. Name another --out.")
+    _spare_inputs(out, there, inputs)
+    # A copy in its place may be what is read.
+    _spare_inputs(out, [copy for copy, file in targets.items() if not (copy.exists() and copy.samefile(file))], inputs)
     if there and not _is_of_a_run(out):
         raise OutputError(f"The results would replace {there[0]}, which no run has written. Name another --out.")
+
+
+def check_fit_folder(out: Path, inputs: Iterable[Path]) -> None:
+    """Raise where the results of a fit would replace one of the inputs, or a file that no fit has written.
+
+    Args:
+        out: the folder, which may be absent.
+        inputs: the files that are read.
+
+    Raises:
+        OutputError: it names the file and what to do.
+    """
+    there = [out / name for name in ("fit.json", "fitted.toml", "fit.png") if (out / name).exists()]
+    _spare_inputs(out, there, inputs)
+    if there and not _has_keys(out / "fit.json", {"found", "loss", "reason"}):
+        raise OutputError(f"The results would replace {there[0]}, which no fit has written. Name another --out.")
+
+
+def _spare_inputs(out: Path, results: Iterable[Path], inputs: Iterable[Path]) -> None:
+    read = [path for path in inputs if path.exists()]
+    for path in results:
+        if path.exists() and any(path.samefile(file) for file in read):
+            raise OutputError(f"The results in {out} would replace {path}, which the run reads. Name another --out.")
 
 
 def keep_inputs(out: Path, files: Mapping[str, Path]) -> dict[str, str]:
@@ -69,10 +90,13 @@ def _copy(key: str, file: Path) -> str:
 
 def _is_of_a_run(out: Path) -> bool:
     """Whether a run has written to a folder, or was interrupted there."""
-    if (out / "restart" / "run.json").exists():
-        return True
+    return (out / "restart" / "run.json").exists() or _has_keys(out / "summary.json", {"scenario", "versions", "files"})
+
+
+def _has_keys(path: Path, keys: set[str]) -> bool:
+    """Whether a file holds a JSON object with these keys."""
     try:
-        found = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return isinstance(found, dict) and {"scenario", "versions", "files"} <= found.keys()
+    return isinstance(found, dict) and keys <= found.keys()

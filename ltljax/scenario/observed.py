@@ -4,6 +4,7 @@ What enters: the table, the folder whose files it may name, the mesh. What leave
 """
 
 import dataclasses
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ import numpy as np
 from ..mesh import Mesh
 from ..mesh.ply import vertex_properties
 from .reader import ScenarioError, Table
+
+# Bytes of the arrays in a file of data: ten million vertices with ten species.
+_LARGEST = 1_000_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +144,11 @@ def _columns(path: Path, table: Table) -> dict[str, np.ndarray]:
 
 
 def _npz(path: Path) -> dict[str, Any]:
+    # A small archive can hold large arrays.
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > _LARGEST:
+        raise ValueError(f"expected arrays of at most {_LARGEST} bytes, found {size}")
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
