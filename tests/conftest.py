@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 # A compilation cache that survives the run: compiling is most of what the tests spend. Programs that call the host are
-# not kept in it, so the checks of the solvers underneath give NaN, which no test survives, and do not raise.
+# not kept in it, so the checks of the solvers underneath give NaN and do not raise.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "ltljax-tests-jax-cache"))
 os.environ.setdefault("EQX_ON_ERROR", "nan")
 

@@ -1,5 +1,6 @@
 """Linear systems and what is made of them: multigrid, Poisson, stationary states, eigenmodes, geodesic distance."""
 
+import gc
 import warnings
 
 import jax
@@ -12,7 +13,7 @@ from jax.test_util import check_grads
 from scipy.special import jn_zeros
 
 import ltljax as ltl
-from ltljax.solve import stationary
+from ltljax.solve import direct, stationary
 from ltljax.solve.implicit import Preconditioning
 from ltljax.solve.krylov import linear_solve
 
@@ -75,7 +76,7 @@ def test_the_cycle_for_the_transpose_is_the_transposed_cycle(sphere):
 def way(request, monkeypatch):
     """How `poisson` solves its systems."""
     if request.param == "multigrid":
-        monkeypatch.setattr(stationary, "_FACTORISED", 0)
+        monkeypatch.setattr(stationary, "_FACTORISED", dict.fromkeys(stationary._FACTORISED, 0))
     return request.param
 
 
@@ -217,7 +218,7 @@ def test_a_factor_is_the_inverse_and_its_transpose(scheme, dtype):
         whole = screening * np.eye(len(areas)) - matrix
         if screening == 0:  # the means over components are moved to the smallest eigenvalue
             same = components[:, None] == components[None]
-            whole = whole + inverse.smallest * same * areas / (same @ areas)[:, None]
+            whole = whole + float(inverse.smallest) * same * areas / (same @ areas)[:, None]
         for transposed in (False, True):
             found = inverse(r, transposed)
             assert found.dtype == dtype
@@ -247,13 +248,70 @@ def test_a_factor_ends_the_iteration_at_once_and_one_that_is_off_still_helps(sph
     assert 1 < counts[1] < 8
 
 
+def test_factors_of_one_size_share_a_program_and_go_with_their_surface():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+    f = surface.vertices[:, 0]
+    ltl.screened_poisson(surface, f, 1.0)
+    gc.collect()
+    before, programs = len(direct._FACTORS), stationary._stationary._cached._cache_size()
+    for screening in np.linspace(1.1, 2.0, 10):
+        ltl.screened_poisson(surface, f, screening)
+    assert stationary._stationary._cached._cache_size() == programs
+    gc.collect()
+    assert len(direct._FACTORS) == before + direct._KEPT - 1  # the last few
+    del surface, f
+    gc.collect()
+    assert len(direct._FACTORS) < before
+
+
+def test_the_factor_of_a_robin_condition_serves_all_its_data():
+    surface = ltl.Surface.from_mesh(ltl.shapes.disk(rings=5))
+    gc.collect()
+    before = len(direct._FACTORS)
+    for g in (0.3, 0.7, 1.1):
+        ltl.poisson(surface, jnp.zeros(surface.num_vertices), ltl.Robin(1.0, 1.0, g))
+    assert len(direct._FACTORS) == before + 1
+    assert isinstance(ltl.factorized(surface, 0.0, ltl.Neumann(np.array([1.0, 2.0]))), ltl.Factorized)
+
+
+def test_a_factor_or_multigrid_is_taken_inside_jit_too(way, monkeypatch):
+    surface = ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(2, 0.3, seed=0))
+    given = []
+    solved = stationary._stationary
+    monkeypatch.setattr(stationary, "_stationary", lambda *args: given.append(type(args[5])) or solved(*args))
+    f = jnp.sin(3 * surface.vertices[:, 0])
+    inside = jax.jit(jax.vmap(lambda f: ltl.screened_poisson(surface, f, 1.0)))(jnp.stack([f, 2 * f]))
+    np.testing.assert_allclose(inside[1] / 2, ltl.screened_poisson(surface, f, 1.0), atol=1e-9)
+    disk = ltl.Surface.from_mesh(ltl.shapes.disk(rings=5))
+    jax.jit(lambda f: ltl.poisson(disk, f, ltl.Dirichlet(0.0)))(jnp.ones(disk.num_vertices))
+    assert given == 3 * [dict(factor=ltl.Factorized, multigrid=ltl.Multigrid)[way]]
+
+
+def test_a_singular_system_is_said():
+    disk = ltl.Surface.from_mesh(ltl.shapes.disk(rings=3))
+    with pytest.raises(ValueError, match="found a singular matrix"):
+        ltl.factorized(disk, 0.0, ltl.Robin(1.0, 0.0, 1.0))
+
+
 def test_a_factor_says_what_it_cannot_do(sphere):
-    with pytest.raises(ValueError, match="nowhere negative, found -1"):
+    with pytest.raises(ValueError, match=r"nowhere negative, .* the least value -1"):
         ltl.factorized(sphere, -1.0)
+    with pytest.raises(ValueError, match=r"number or of shape \(642,\), found \(642, 1\)"):
+        ltl.screened_poisson(sphere, jnp.zeros(642), np.ones((642, 1)))
     with pytest.raises(ValueError, match="vanish on more than constants"):
         ltl.factorized(ltl.Surface.from_mesh(ltl.shapes.icosphere(2), ltl.Paper()))
-    with pytest.raises(ValueError, match="being traced"):
-        jax.jit(lambda x: ltl.factorized(sphere.with_vertices(x)).smallest)(sphere.vertices)
+    for traced in (
+        lambda x: ltl.factorized(sphere.with_vertices(x)).smallest,
+        lambda x: ltl.factorized(sphere, x[:, 0]).smallest,
+    ):
+        with pytest.raises(ValueError, match="being traced"):
+            jax.jit(traced)(sphere.vertices)
+    inverse = ltl.factorized(sphere)
+    with pytest.raises(TypeError, match=r"Multigrid|multigrid"):
+        ltl.solve(ltl.Diffusion(), sphere, jnp.zeros(642), 1.0, solver=ltl.BackwardEuler(), preconditioner=inverse)
+    reaction = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(0.1, 0.9))
+    with pytest.raises(ValueError, match="has many"):
+        ltl.steady_state(reaction, sphere, jnp.ones((642, 2)), preconditioner=inverse)
 
 
 def test_heat_with_a_source_reaches_its_stationary_state_both_ways():

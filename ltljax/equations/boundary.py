@@ -144,9 +144,14 @@ def absorption(
     surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, " V"]:
     """What Robin conditions take from -Delta u at each vertex, per unit of u; the mean over species."""
-    conditions = tuple(condition for condition in as_tuple(conditions) if not isinstance(condition, Dirichlet))
-    affine = lambda u: bounded_laplacian(surface, conditions, t, u)  # noqa: E731
-    taken = affine(jnp.zeros_like(u)) - affine(jnp.ones_like(u))
+    linear = tuple(
+        Robin(condition.a, condition.b, 0.0, condition.where)
+        if isinstance(condition, Robin)
+        else Neumann(0.0, condition.where)
+        for condition in as_tuple(conditions)
+        if not isinstance(condition, Dirichlet)
+    )
+    taken = -bounded_laplacian(surface, linear, t, jnp.ones_like(u))
     return jnp.mean(taken.reshape(surface.num_vertices, -1), axis=1)
 
 

@@ -253,6 +253,10 @@ def solve(
     checks.finite(equation, u0)
     if isinstance(surface.scheme, Polynomial) and not surface.is_traced:
         _warn_of_growth(surface)
+    if preconditioner is not None and not isinstance(preconditioner, Multigrid):
+        raise TypeError(
+            f"Expected as preconditioner what ltl.multigrid(surface) returned, found {type(preconditioner).__name__}."
+        )
     # As arrays, so that other tolerances need no compiling.
     relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
     if solver is None:
@@ -339,10 +343,14 @@ def what_is_fixed(
     equation: Equation, surface: Surface, u0: Array, t0: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """What conditions absorb and which vertices they hold (host); None where that is being traced."""
-    time = jnp.asarray(t0, surface.dtype)
     conditions = equation.conditions
-    is_held = bounds.held_vertices(surface, conditions)
-    absorption = bounds.absorption(surface, conditions, time, u0) if conditions else jnp.zeros(surface.num_vertices)
+    # Inside jit too, of what is not being traced itself.
+    with jax.ensure_compile_time_eval():
+        time, like = jnp.asarray(t0, surface.dtype), jnp.zeros(u0.shape, u0.dtype)
+        is_held = bounds.held_vertices(surface, conditions)
+        absorption = (
+            bounds.absorption(surface, conditions, time, like) if conditions else jnp.zeros(surface.num_vertices)
+        )
     if isinstance(is_held, Tracer):
         return None
     # Where the data of conditions are being traced their absorption is left out: a preconditioner may be off.

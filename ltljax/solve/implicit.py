@@ -21,7 +21,6 @@ from jaxtyping import Array, Float
 from ..equations import Equation
 from ..operators import diagonal
 from ..surface import Surface
-from .direct import Factorized
 from .krylov import BiCGStab, Preconditioner, linear_solve
 from .multigrid import Multigrid
 
@@ -59,19 +58,17 @@ class Preconditioning(eqx.Module):
     Jacobi's method.
 
     Attributes:
-        multigrid: the hierarchy of the surface, or a factor; None for Jacobi's method.
+        multigrid: the hierarchy of the surface; None for Jacobi's method.
         rtol: relative tolerance of a step.
         atol: absolute tolerance of a step.
     """
 
-    multigrid: Multigrid | Factorized | None = None
+    multigrid: Multigrid | None = None
     rtol: Array | float = 1e-4
     atol: Array | float = 1e-6
 
     def of(self, surface: Surface, alpha: Array, beta: Array) -> Preconditioner:
         """An approximate inverse of ``alpha - beta Delta``, with one alpha and one beta for every species."""
-        if isinstance(self.multigrid, Factorized):
-            return self.multigrid
         if self.multigrid is not None:
             return Cycle(self.multigrid, alpha, beta)
         return Jacobi(1 / (alpha[None] - beta[None] * diagonal(surface)[:, None]))

@@ -214,7 +214,9 @@ def multigrid(surface: Surface, absorption: np.ndarray | None = None, is_held: n
     absorption = np.zeros(size) if absorption is None else np.asarray(absorption, np.float64)
     is_held = np.zeros(size, bool) if is_held is None else np.asarray(is_held)
     key = f"multigrid {hash((absorption.tobytes(), is_held.tobytes()))}"
-    return surface.remembered(key, lambda: _set_up(surface, absorption, is_held))
+    # Inside jit too, of a surface that is not traced.
+    with jax.ensure_compile_time_eval():
+        return surface.remembered(key, lambda: _set_up(surface, absorption, is_held))
 
 
 def _set_up(surface: Surface, absorption: np.ndarray, is_held: np.ndarray) -> Multigrid:

@@ -4,6 +4,7 @@ What enters: a surface, and a right side or an equation with a first state. What
 implicit function theorem.
 """
 
+import contextlib
 import warnings
 from typing import Any, Literal
 
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..equations import Diffusion, Equation
 from ..equations import boundary as bounds
-from ..lifting.schemes import Monotone, Paper
+from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..operators import spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
@@ -37,8 +38,9 @@ _DISCRETE = 4 * np.pi
 _MAX_MARCH = 500
 _MAX_NEWTON = 5
 _GROWN = 1e6
-# Vertices up to which elimination is faster than iteration, on CPU.
-_FACTORISED = 50_000
+# Vertices up to which elimination is faster than iteration, on CPU: benchmarks/direct.md. The matrix of `Paper` may be
+# singular beyond constants.
+_FACTORISED = {Monotone: 50_000, Polynomial: 20_000, Paper: 0}
 # Of the steps in time towards a stationary state, in units of the reaction's time.
 _LONGEST = 1e4
 
@@ -63,10 +65,11 @@ def poisson(
     more than discretisation makes of none (``4 pi`` over the number of vertices, of the size of f, or a hundredth), and
     the u whose mean (in the vertex areas) is zero is returned.
 
-    On CPU and up to 50,000 vertices by a factor of the matrix, made once for a surface (`factorized`). Otherwise by
-    Krylov iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by
-    multigrid (the extra `amg`; without it by Jacobi's method, which takes many more iterations). Differentiable in f,
-    the data of the conditions and, with a ``preconditioner``, the vertices.
+    On CPU and up to 50,000 vertices (of ``Polynomial`` 20,000) by a factor of the matrix, made once for a surface
+    (`factorized`); programs that ask it are not kept in JAX's persistent compilation cache. Otherwise by Krylov
+    iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by multigrid
+    (the extra `amg`; without it by Jacobi's method, which takes many more iterations). Differentiable in f, the data of
+    the conditions and, with a ``preconditioner``, the vertices.
 
     Args:
         surface: the surface.
@@ -110,6 +113,10 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
     checks.state(surface, f)
     if not isinstance(f, Tracer) and not np.isfinite(np.asarray(f)).all():
         raise ValueError(f"The right side is not finite at vertex {np.argwhere(~np.isfinite(np.asarray(f)))[0][0]}.")
+    if jnp.shape(screening) not in ((), f.shape[:1]):
+        raise ValueError(
+            f"Expected a screening that is a number or of shape {f.shape[:1]}, found {jnp.shape(screening)}."
+        )
     equation = Diffusion(1.0, source=-f, boundary=() if boundary is None else boundary)
     preconditioner = _inverse(equation, surface, f, screening) if preconditioner is None else preconditioner
     tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
@@ -131,15 +138,17 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
 
 
 def _inverse(equation: Diffusion, surface: Surface, f: Array, screening: Any) -> Multigrid | Factorized | None:
-    """A factor of a small system on CPU, else multigrid: benchmarks/direct.md."""
-    is_small = surface.num_vertices <= _FACTORISED and jax.default_backend() == "cpu"
-    if not is_small or surface.is_traced or isinstance(screening, Tracer) or isinstance(surface.scheme, Paper):
-        return hierarchy(equation, surface, f, 0.0)
-    fixed = what_is_fixed(equation, surface, f, 0.0)
-    if fixed is None:
-        return None
-    absorption, is_held = fixed
-    return factor(surface, np.asarray(screening, np.float64) + absorption, is_held)
+    """A factor of a small system on CPU, else multigrid."""
+    is_small = surface.num_vertices <= _FACTORISED[type(surface.scheme)] and jax.default_backend() == "cpu"
+    fixed = None
+    if is_small and not surface.is_traced and not isinstance(screening, Tracer):
+        fixed = what_is_fixed(equation, surface, f, 0.0)
+    if fixed is not None:
+        absorption, is_held = fixed
+        # One that is singular may still be solved by iteration.
+        with contextlib.suppress(RuntimeError):
+            return factor(surface, np.asarray(screening, np.float64) + absorption, is_held)
+    return hierarchy(equation, surface, f, 0.0)
 
 
 def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, float] | None:
@@ -159,14 +168,19 @@ def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, floa
 
 
 def _unconverged(steps: int, preconditioner: Multigrid | Factorized | None) -> str:
-    cure = 'Install the extra "amg" for multigrid' if preconditioner is None else "Raise the tolerance, or use float64"
+    if preconditioner is None:
+        cure = 'Install the extra "amg" for multigrid'
+    elif isinstance(preconditioner, Factorized):
+        cure = "Hand in the factor of this system, raise the tolerance, or use float64"
+    else:
+        cure = "Raise the tolerance, or use float64"
     return f"The linear system was not solved within {steps} iterations. {cure}."
 
 
 @eqx.filter_jit
 def _stationary(
     equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array,
-    multigrid: Multigrid | Factorized | None, tolerance: Any,
+    inverse: Multigrid | Factorized | None, tolerance: Any,
 ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes) for
     every component and column, whether it was found, and in how many iterations."""
@@ -176,7 +190,7 @@ def _stationary(
     lost = bounds.absorption(surface, equation.conditions, time, start) + screening
     fixes = jnp.where(is_held, 1.0, jnp.abs(lost))
     diffusivities = equation.diffusivities(start)
-    scale = 1.0 if multigrid is None else multigrid.smallest
+    scale = 1.0 if inverse is None else inverse.smallest
 
     def rate(u):
         return equation.rate(time, surface, u) - jnp.where(is_held, 0, screening).reshape(-1, *trailing) * u
@@ -202,11 +216,12 @@ def _stationary(
     right = jnp.where(is_held.reshape(-1, *trailing), 0, value)
     flat = diffusivities.reshape(-1) if trailing else diffusivities[None]
     alpha = jnp.broadcast_to(jnp.mean(screening), flat.shape)
-    inverse = Preconditioning(multigrid).of(surface, alpha, flat)
+    is_factor = isinstance(inverse, Factorized)
+    preconditioner = inverse if is_factor else Preconditioning(inverse).of(surface, alpha, flat)
     # Of high order the operator may be far from the one that preconditions it.
     persists = not isinstance(surface.scheme, Monotone)
-    most = 200 if multigrid is not None else 20_000
-    found = linear_solve(apply, right, inverse, tolerance, most, persists=persists)
+    most = 200 if inverse is not None else 20_000
+    found = linear_solve(apply, right, preconditioner, tolerance, most, persists=persists)
     constants = means(found.value)
     u = start + found.value - jnp.where(
         is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
@@ -274,6 +289,11 @@ def steady_state(
     u0 = jnp.asarray(u0, surface.dtype)
     checks.state(surface, u0)
     checks.finite(equation, u0)
+    if isinstance(preconditioner, Factorized) and not isinstance(equation, Diffusion):
+        raise ValueError(
+            f"A factor is that of one linear system, but {type(equation).__name__} has many. Hand in "
+            "ltl.multigrid(surface) as preconditioner."
+        )
     if not tolerance > 0 or not t1 > 0:
         raise ValueError(f"Expected a positive tolerance and a positive t1, found {tolerance} and {t1}.")
     if method not in ("newton", "marching"):
