@@ -32,8 +32,10 @@ from jaxtyping import Array, Float
 
 from .table import AnyArray, Block, ReverseWeights, Table, reverse_weights, take
 
-# Beyond this many slots a loop unrolled over slots only costs compile time.
-_UNROLL = 32
+# Beyond so many slots, of few rows or of any, a loop unrolled over slots costs more compile time than it is worth. One
+# that is not takes ten times as long (the coarse levels of multigrid are wide, and made a cycle twice as long).
+_UNROLL, _UNROLL_MANY = 32, 64
+_MANY = 256
 
 Argument = Literal["weights", "field", "rows"]
 _ARGUMENTS: tuple[Argument, ...] = ("weights", "field", "rows")
@@ -147,7 +149,7 @@ def _scattered(table: Table, weights: Any, y: Any) -> list[Array]:
 
 def _row_sums(block: Block, weights: Array, u: Array) -> Array:
     centre = block.centre(u)
-    if weights.shape[0] > _UNROLL:
+    if not _is_unrolled(block):
         return jnp.sum(_over_species(weights, u) * (block.neighbours(u) - centre[None]), axis=0)
     # Unrolled, the slots fuse into one pass over u with no (K, N) intermediate.
     total = jnp.zeros_like(centre)
@@ -156,9 +158,14 @@ def _row_sums(block: Block, weights: Array, u: Array) -> Array:
     return total
 
 
+def _is_unrolled(block: Block) -> bool:
+    slots, rows = block.indices.shape
+    return slots <= (_UNROLL_MANY if rows >= _MANY else _UNROLL)
+
+
 def _products(block: Block, u: Array, y: Array) -> Array:
     here, centre = block.centre(y), block.centre(u)
-    if block.indices.shape[0] > _UNROLL:
+    if not _is_unrolled(block):
         return jnp.sum(here[None] * (block.neighbours(u) - centre[None]), axis=tuple(range(2, u.ndim + 1)))
     species = tuple(range(1, u.ndim))
     return jnp.stack([jnp.sum(here * (take(u, neighbours) - centre), axis=species) for neighbours in block.indices])
