@@ -38,8 +38,9 @@ _DISCRETE = 4 * np.pi
 _MAX_MARCH = 500
 _MAX_NEWTON = 5
 _GROWN = 1e6
-# Vertices up to which elimination is faster than iteration, on CPU: benchmarks/direct.md. The matrix of `Paper` may be
-# singular beyond constants.
+# Vertices up to which elimination is faster than iteration, on CPU: benchmarks/direct.md for `Monotone`. Factors of
+# `Polynomial` have four times the entries and take four times as long to make; the matrix of `Paper` may be singular
+# beyond constants.
 _FACTORISED = {Monotone: 50_000, Polynomial: 20_000, Paper: 0}
 # Of the steps in time towards a stationary state, in units of the reaction's time.
 _LONGEST = 1e4
