@@ -1,20 +1,26 @@
-"""The command line: ``ltljax run``, ``ltljax fit``, ``ltljax new``, ``ltljax list``, ``ltljax info``."""
+"""The command line: ``ltljax run``, ``fit``, ``new``, ``list``, ``info``, and commands on a mesh: ``denoise``,
+``smooth``, ``lic``, ``curvature``, ``distance``.
+"""
 
 import argparse
 import dataclasses
 import difflib
 import io
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
 
-from . import scenario
+from . import process, scenario
 from .fit import FitError
 from .lifting.schemes import Monotone, Paper, Polynomial, Scheme
 from .mesh import load_mesh
+from .process.fields import FIELDS
+from .process.images import METHODS
+from .process.shapes import SMOOTHINGS
 from .recover import recover
 from .run import run
 from .solve import SolveError
@@ -115,7 +121,61 @@ def _parser() -> argparse.ArgumentParser:
     info.set_defaults(command=_info)
     info.add_argument("mesh", help="a mesh file")
     info.add_argument("--repair", action="store_true", help="mend what can be mended")
+    _add_commands_on_meshes(commands)
     return parser
+
+
+def _add_commands_on_meshes(commands: Any) -> None:
+    def command(name: str, on_mesh: Callable[[argparse.Namespace], None], says: str) -> argparse.ArgumentParser:
+        parser = commands.add_parser(name, help=says, description=says)
+        parser.set_defaults(command=_on_mesh, on_mesh=on_mesh)
+        parser.add_argument("mesh", help="sphere, torus, disk, or a mesh file, which keeps its scale")
+        parser.add_argument(
+            "--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)"
+        )
+        parser.add_argument("--repair", action="store_true", help="mend what can be mended")
+        return parser
+
+    denoise = command("denoise", _denoise, "take noise off an image, numbers or colours on a mesh; edges stay")
+    what = denoise.add_mutually_exclusive_group()
+    what.add_argument("--image", type=Path, help="on the mesh's UV map (default: the colours of the mesh file)")
+    what.add_argument("--data", type=Path, metavar="FILE", help="numbers for every vertex: a CSV, NPZ, PLY or VTP file")
+    denoise.add_argument("--name", metavar="COLUMN", help="of the data (default: the only one, or red, green and blue)")
+    much = denoise.add_mutually_exclusive_group()
+    much.add_argument("--noise", type=_positive, help="its standard deviation in each value (default: estimated)")
+    much.add_argument(
+        "--strength", type=_positive, help="instead: of tv in values times length, of the others the time of diffusion"
+    )
+    denoise.add_argument("--method", choices=METHODS, default="tv", help="default: tv, the least total variation")
+
+    smooth = command("smooth", _smooth, "smooth a mesh")
+    smooth.add_argument(
+        "--method", choices=SMOOTHINGS, default="flow",
+        help="mean curvature flow, one implicit step of it, or a filter of normals that keeps edges (default: flow)",
+    )  # fmt: skip
+    smooth.add_argument("--time", type=_positive, help="of the flow, a length squared (default: of half a mean edge)")
+    smooth.add_argument(
+        "--strength", type=_positive,
+        help="of fair, a length squared (default: half of that of a mean edge); of features, how far unit normals "
+        "differ that count as the same (default: 0.35)",
+    )  # fmt: skip
+    smooth.add_argument("--steps", type=_count, help="of the flow (default: 10), or rounds of features (default: 5)")
+    smooth.add_argument("--keep-volume", action="store_true", help="flow and fair: give back what is lost")
+
+    lic = command("lic", _lic, "draw lines on a mesh by line integral convolution")
+    lic.add_argument(
+        "--field", choices=FIELDS, default="smallest",
+        help="along the smallest or largest curvature, smooth crosses, or around the vertical (default: smallest)",
+    )  # fmt: skip
+    lic.add_argument("--resolution", type=_count, default=600, help="pixels of the picture's height (default: 600)")
+
+    command("curvature", _curvature, "draw how a mesh bends: mean and Gauss curvature, ridges and valleys")
+
+    distance = command("distance", _distance, "draw the distance along a mesh from vertices, in bands")
+    distance.add_argument(
+        "--from", type=_seed, nargs="+", required=True, metavar="V", dest="sources",
+        help="vertices, counted from 0 in the order of the file",
+    )  # fmt: skip
 
 
 def _positive(text: str) -> float:
@@ -161,6 +221,38 @@ def _new(options: argparse.Namespace) -> int:
 def _info(options: argparse.Namespace) -> int:
     print(load_mesh(options.mesh, repair=options.repair).report)
     return 0
+
+
+def _on_mesh(options: argparse.Namespace) -> int:
+    jax.config.update("jax_enable_x64", True)
+    options.on_mesh(options)
+    return 0
+
+
+def _denoise(options: argparse.Namespace) -> None:
+    process.denoise(
+        options.mesh, options.out, image=options.image, data=options.data, name=options.name, noise=options.noise,
+        strength=options.strength, method=options.method, repair=options.repair,
+    )  # fmt: skip
+
+
+def _smooth(options: argparse.Namespace) -> None:
+    process.smooth(
+        options.mesh, options.out, method=options.method, time=options.time, strength=options.strength,
+        steps=options.steps, keep_volume=options.keep_volume, repair=options.repair,
+    )  # fmt: skip
+
+
+def _lic(options: argparse.Namespace) -> None:
+    process.lic(options.mesh, options.out, field=options.field, resolution=options.resolution, repair=options.repair)
+
+
+def _curvature(options: argparse.Namespace) -> None:
+    process.curvature(options.mesh, options.out, repair=options.repair)
+
+
+def _distance(options: argparse.Namespace) -> None:
+    process.distance(options.mesh, options.out, sources=options.sources, repair=options.repair)
 
 
 def _scheme(name: str, degree: int | None) -> Scheme:

@@ -30,6 +30,18 @@ MESHES = Path(__file__).parents[2] / "shared" / "meshes"
 def few_compiled_functions():
     """Compiled functions are let go of after each file: every one keeps pages mapped, and the kernel allows 65,530."""
     yield
+    _let_go()
+
+
+@pytest.fixture(autouse=True)
+def few_compiled_functions_of_a_slow_test(request):
+    """And after each slow test, which may compile hundreds."""
+    yield
+    if request.node.get_closest_marker("slow"):
+        _let_go()
+
+
+def _let_go():
     jax.clear_caches()
     gc.collect()
 

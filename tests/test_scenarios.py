@@ -12,8 +12,8 @@ import trimesh
 import ltljax as ltl
 from ltljax import scenario
 from ltljax.cli import main
+from ltljax.mesh import columns
 from ltljax.output import files
-from ltljax.scenario import observed
 from ltljax.scenario.written import KINETICS
 
 PLAIN = """
@@ -455,7 +455,7 @@ def test_columns_of_a_ply_file_are_all_but_the_positions(tmp_path):
     head = "ply\nformat ascii 1.0\nelement vertex 1\n"
     head += "".join(f"property double {name}\n" for name in ("x", "y", "z", "xy", "u")) + "end_header\n"
     path.write_text(head + "1 2 3 4 5\n")
-    assert {name: float(values[0]) for name, values in observed._ply(path).items()} == dict(xy=4.0, u=5.0)
+    assert {name: float(values[0]) for name, values in columns.read_columns(path).items()} == dict(xy=4.0, u=5.0)
 
 
 def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_path, capsys):
@@ -541,7 +541,7 @@ def test_a_broken_fit_is_one_clear_line(name, seen, tmp_path, capsys):
 
 
 def test_data_that_memory_would_not_hold_are_refused_unread(seen, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(observed, "_LARGEST", 1000)
+    monkeypatch.setattr(columns, "_LARGEST", 1000)
     for name, state in zip(("early", "late"), seen[1], strict=True):
         keep("npz", tmp_path, name, state, seen[0])
     (tmp_path / "mine.toml").write_text(PLAIN + SOUGHT)

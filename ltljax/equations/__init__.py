@@ -7,6 +7,7 @@ from .diffusion import Diffusion
 from .equation import Equation
 from .moving import Moving
 from .reaction_diffusion import ReactionDiffusion
+from .vector_diffusion import VectorDiffusion
 
 __all__ = [
     "CahnHilliard",
@@ -17,5 +18,6 @@ __all__ = [
     "Neumann",
     "ReactionDiffusion",
     "Robin",
+    "VectorDiffusion",
     "kinetics",
 ]

@@ -54,6 +54,16 @@ def colormap_samples(name: str) -> np.ndarray:
     return COLORMAPS[name]
 
 
+def striped(colormap: str, count: int) -> np.ndarray:
+    """Samples (N, 3) of a colour map in so many bands, every second one darker, whose borders are contours."""
+    table = colormap_samples(colormap)
+    # Of a band, so many samples that its border is sharp.
+    place = np.linspace(0, 1, 64 * count)
+    samples = np.stack([np.interp(place, np.linspace(0, 1, len(table)), channel) for channel in table.T], axis=1)
+    is_dark = np.arange(len(place)) // 64 % 2 == 1
+    return np.round(np.where(is_dark[:, None], 0.6, 1.0) * samples).astype(np.uint8)
+
+
 def vertex_colors(
     values: np.ndarray, limits: tuple[float, float] | None = None, colormap: str = "viridis"
 ) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Surfaces and their fields as files: VTK PolyData and time series for ParaView, PLY and GLB with colours."""
+"""Surfaces and their fields as files: VTK PolyData and time series for ParaView, PLY and GLB with colours, OBJ."""
 
 import base64
 import json
@@ -17,6 +17,30 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
     data = surface.export(file_type="ply")
     assert isinstance(data, bytes)
     path.write_bytes(data)
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None, material: str | None = None
+) -> None:
+    """Write an OBJ.
+
+    Args:
+        path: where to.
+        vertices: (V, 3).
+        faces: (F, 3).
+        uv: (F, 3, 2) places in an image of the corners of every face.
+        material: the name of an MTL file beside it, whose material ``surface`` the faces have.
+    """
+    lines = [] if material is None else [f"mtllib {material}", "usemtl surface"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    if uv is None:
+        lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
+    else:
+        places, index = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
+        corners = np.stack([faces + 1, index.reshape(faces.shape) + 1], axis=2)
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in places.tolist()]
+        lines += ["f " + " ".join(f"{vertex}/{place}" for vertex, place in face) for face in corners.tolist()]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def write_glb(

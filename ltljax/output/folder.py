@@ -1,4 +1,4 @@
-"""The folder of a run: copies of the files it was made from, and nothing of the user's replaced.
+"""The folder of a run or of another command: copies of the files it was made from, and nothing of the user's replaced.
 
 What enters: the folder, the name of the run, the files it reads. What leaves: copies of these under ``inputs``, or an
 `OutputError` before anything is computed.
@@ -57,6 +57,26 @@ def check_fit_folder(out: Path, inputs: Iterable[Path]) -> None:
     _spare_inputs(out, there, inputs)
     if there and not _has_keys(out / "fit.json", {"found", "loss", "reason"}):
         raise OutputError(f"The results would replace {there[0]}, which no fit has written. Name another --out.")
+
+
+def check_results(out: Path, marker: str, results: Iterable[str], inputs: Iterable[Path]) -> None:
+    """Raise where the results of a command would replace one of the inputs, or a file that it has not written.
+
+    Args:
+        out: the folder, which may be absent.
+        marker: the name of the JSON file by which the command knows what it has written.
+        results: the names of the other files that it may write.
+        inputs: the files that are read.
+
+    Raises:
+        OutputError: it names the file and what to do.
+    """
+    there = [path for path in (out / name for name in (marker, *results)) if path.exists()]
+    _spare_inputs(out, there, inputs)
+    if there and not _has_keys(out / marker, {"command", "measured", "versions"}):
+        raise OutputError(
+            f"The results would replace {there[0]}, which no such command has written. Name another --out."
+        )
 
 
 def _spare_inputs(out: Path, results: Iterable[Path], inputs: Iterable[Path]) -> None:

@@ -22,14 +22,14 @@ def can_draw() -> bool:
 
 
 class Picture:
-    """A surface with a colour-mapped field on it, drawn off-screen.
+    """A surface with a colour-mapped field on it, or with colours, drawn off-screen.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3).
         title: the name of the field, beside the colour bar.
-        limits: the ends of the colour bar.
-        colormap: one of `ltljax.output.colors.COLORMAPS`.
+        limits: the ends of the colour bar; None where what is drawn are colours, (V, 3) of unsigned bytes.
+        colormap: one of `ltljax.output.colors.COLORMAPS`, or the samples (N, 3) of one.
     """
 
     def __init__(
@@ -37,13 +37,14 @@ class Picture:
         vertices: np.ndarray,
         faces: np.ndarray,
         title: str,
-        limits: tuple[float, float],
-        colormap: str = "viridis",
+        limits: tuple[float, float] | None,
+        colormap: str | np.ndarray = "viridis",
     ):
         import pyvista
 
         self._surface: Any = pyvista.PolyData.from_regular_faces(vertices, faces)
-        self._surface[title] = np.full(len(vertices), limits[0])
+        count = len(vertices)
+        self._surface[title] = np.zeros((count, 3), np.uint8) if limits is None else np.full(count, limits[0])
         self._title = title
         self._text: Any = None
         # Without a display VTK says so before it renders off-screen all the same.
@@ -51,24 +52,27 @@ class Picture:
         with self._quiet("error"):
             self._plotter = self._compose(pyvista.Plotter, limits, colormap)
 
-    def _compose(self, plotter_class: Any, limits: tuple[float, float], colormap: str) -> Any:
+    def _compose(self, plotter_class: Any, limits: tuple[float, float] | None, colormap: str | np.ndarray) -> Any:
         from matplotlib.colors import LinearSegmentedColormap  # which PyVista brings
 
         plotter = plotter_class(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
         bar = dict(color="black", fmt="%.3g", n_labels=2, position_x=0.3, position_y=0.02, width=0.65, height=0.08)
+        painted: dict[str, Any] = dict(rgb=True)
+        if limits is not None:
+            samples = colormap_samples(colormap) if isinstance(colormap, str) else colormap
+            shades = LinearSegmentedColormap.from_list("samples", samples / 255, max(len(samples), 256))
+            painted = dict(clim=limits, cmap=shades, n_colors=shades.N, interpolate_before_map=True)
         for column, view in enumerate(_VIEWS):
             plotter.subplot(0, column)
             plotter.set_background("white")
             plotter.add_mesh(
                 self._surface,
                 scalars=self._title,
-                clim=limits,
-                cmap=LinearSegmentedColormap.from_list(colormap, colormap_samples(colormap) / 255),
                 smooth_shading=True,
-                interpolate_before_map=True,
                 ambient=0.25,
-                show_scalar_bar=column == 1,
+                show_scalar_bar=limits is not None and column == 1,
                 scalar_bar_args=dict(title=self._title, **bar),
+                **painted,
             )
             plotter.view_vector(view, viewup=(0, 1, 0))
             plotter.camera.zoom(1.1)
@@ -76,7 +80,7 @@ class Picture:
         return plotter
 
     def draw(self, values: np.ndarray, caption: str = "") -> np.ndarray:
-        """The picture (height, width, 3) of unsigned bytes of the field's values (V,)."""
+        """The picture (height, width, 3) of unsigned bytes of the field's values (V,), or of colours (V, 3)."""
         self._surface[self._title][:] = values
         if self._text is not None:
             self._plotter.remove_actor(self._text)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .files import write_obj
+
 # Triangles are painted in groups whose boxes have at most this many pixels together.
 _PIXELS = 4_000_000
 # A map whose faces have more pixels than this many images is tiled: each pixel would stand for many places.
@@ -83,16 +85,10 @@ def write_textured_obj(
     """
     from .pictures import write_png
 
-    places, index = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
-    corners = np.stack([faces + 1, index.reshape(faces.shape) + 1], axis=2)
     # Readers of OBJ files disagree about letters beyond ASCII in names: those of these two files have none.
     stem = path.stem if path.stem.isascii() else "surface"
     material, picture = path.with_name(f"{stem}.mtl"), path.with_name(f"{stem}.png")
-    lines = [f"mtllib {material.name}", "usemtl surface"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
-    lines += [f"vt {u:.9g} {v:.9g}" for u, v in places.tolist()]
-    lines += ["f " + " ".join(f"{vertex}/{place}" for vertex, place in face) for face in corners.tolist()]
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    write_obj(path, vertices, faces, uv, material.name)
     material.write_text(f"newmtl surface\nKd 1 1 1\nKs 0 0 0\nmap_Kd {picture.name}\n", encoding="ascii")
     write_png(picture, image)
     return [path, material, picture]

@@ -4,19 +4,13 @@ What enters: the table, the folder whose files it may name, the mesh. What leave
 """
 
 import dataclasses
-import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..mesh import Mesh
-from ..mesh.ply import vertex_properties
-from .reader import ScenarioError, Table
-
-# Bytes of the arrays in a file of data: ten million vertices with ten species.
-_LARGEST = 1_000_000_000
+from ..mesh.columns import DataError, read_columns
+from .reader import Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,50 +121,7 @@ def _vertices(here: np.ndarray | None, mesh: Mesh, table: Table) -> np.ndarray |
 
 def _columns(path: Path, table: Table) -> dict[str, np.ndarray]:
     """The arrays of a file, by name."""
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise table.error("file", f"a file that ends in {', '.join(_READERS)}")
     try:
-        found = reader(path)
-        return {name: np.asarray(values, np.float64) for name, values in found.items()}
-    except ScenarioError:
-        raise
-    except ImportError:
-        raise table.error(
-            "file", 'a file that can be read without the extra "viz" (pip install "ltljax[viz]")'
-        ) from None
-    except Exception as error:
-        raise table.error("file", f"a sound file ({' '.join(str(error).split())[:200]})") from None
-
-
-def _npz(path: Path) -> dict[str, Any]:
-    # A small archive can hold large arrays.
-    with zipfile.ZipFile(path) as archive:
-        size = sum(entry.file_size for entry in archive.infolist())
-    if size > _LARGEST:
-        raise ValueError(f"expected arrays of at most {_LARGEST} bytes, found {size}")
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
-
-
-def _csv(path: Path) -> dict[str, Any]:
-    lines = path.read_text(encoding="utf-8-sig").splitlines()  # spreadsheets begin with a mark
-    names = [name.strip() for name in lines[0].split(",")]
-    values = np.array([[float(entry) for entry in line.split(",")] for line in lines[1:] if line.strip()])
-    if values.ndim != 2 or values.shape[1] != len(names):
-        raise ValueError(f"expected rows of {len(names)} numbers below the names")
-    return dict(zip(names, values.T, strict=True))
-
-
-def _ply(path: Path) -> dict[str, Any]:
-    positions = {"x", "y", "z"}
-    return {name: values for name, values in vertex_properties(path.read_bytes()).items() if name not in positions}
-
-
-def _vtp(path: Path) -> dict[str, Any]:
-    import pyvista
-
-    return {name: values for name, values in pyvista.read(path).point_data.items() if values.ndim == 1}
-
-
-_READERS: dict[str, Callable[[Path], dict[str, Any]]] = {".npz": _npz, ".csv": _csv, ".ply": _ply, ".vtp": _vtp}
+        return read_columns(path)
+    except DataError as error:
+        raise table.error("file", error.expected) from None

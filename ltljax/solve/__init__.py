@@ -4,6 +4,7 @@ multigrid, eigenmodes, and what linear theory says before a run."""
 from .direct import Factorized, factorized
 from .distance import geodesic_distance
 from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
+from .hodge import HarmonicFields, HodgeParts, harmonic_fields, helmholtz_hodge
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
 from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
@@ -11,6 +12,7 @@ from .restart import RestartError
 from .stabilised import RKL1, RKL2
 from .stability import Dispersion, Explanation, dispersion, explain
 from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
+from .vector_heat import connection_matrix, direction_field, transport_vectors
 
 __all__ = [
     "RKL1",
@@ -24,20 +26,27 @@ __all__ = [
     "Explanation",
     "Factorized",
     "GrowingModesWarning",
+    "HarmonicFields",
+    "HodgeParts",
     "IncompatibleSourceWarning",
     "Multigrid",
     "RestartError",
     "Solution",
     "SolveError",
     "Steady",
+    "connection_matrix",
+    "direction_field",
     "dispersion",
     "eigenmodes",
     "explain",
     "factorized",
     "geodesic_distance",
+    "harmonic_fields",
+    "helmholtz_hodge",
     "multigrid",
     "poisson",
     "screened_poisson",
     "solve",
     "steady_state",
+    "transport_vectors",
 ]

@@ -49,11 +49,8 @@ def geodesic_distance(
         raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
     here = np.zeros(surface.num_vertices)
     here[sources] = 1
-    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces)
-    if time is None:
-        mean = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean()
-        time = max(mean, 2 * np.linalg.norm(np.ptp(vertices, axis=0)) / _DECAY) ** 2
-    stepped = scipy.sparse.eye_array(len(here)) - time * laplacian_matrix(surface).astype(np.float64)
+    step = shortest_step(surface) if time is None else time
+    stepped = scipy.sparse.eye_array(len(here)) - step * laplacian_matrix(surface).astype(np.float64)
     # Without pivoting, so that nothing is ever subtracted.
     factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(stepped), diag_pivot_thresh=0.0)
     heat = np.maximum(factors.solve(here), np.finfo(np.float64).tiny)
@@ -70,6 +67,13 @@ def geodesic_distance(
     for component in np.unique(components[sources]):
         nearest[component] = np.asarray(distance)[sources[components[sources] == component]].min()
     return distance - jnp.asarray(nearest[components], surface.dtype)
+
+
+def shortest_step(surface: Surface) -> float:
+    """The time of a step of heat that tells shortest paths: the square of the mean distance of neighbours (host)."""
+    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces)
+    mean = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean()
+    return float(max(mean, 2 * np.linalg.norm(np.ptp(vertices, axis=0)) / _DECAY)) ** 2
 
 
 @eqx.filter_jit

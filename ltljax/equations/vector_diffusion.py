@@ -1,0 +1,88 @@
+"""Tangent vector fields that diffuse and react."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..operators import spectral_bound
+from ..surface import Surface
+from ..tables import AnyArray
+from ..vectors import connection, from_frame, tangential, to_frame
+from .equation import Equation
+
+Reaction = Callable[..., AnyArray]
+
+
+class VectorDiffusion(Equation):
+    """X_t = D Delta X + f(X) for a tangent field X, the state (V, 3), or for S fields at once, (V, S, 3).
+
+    Delta is `vector_laplacian`; of the state the tangent part counts, and what X_t adds is tangent. Without a reaction
+    no vector becomes longer than the longest at the start (with `Monotone`).
+
+    Attributes:
+        diffusivity: D, a positive number; for several fields also one for each, (S,).
+        reaction: f, a plain function ``(X, params) -> rate`` of the vectors at one point, (3,) or (S, 3); of the rate
+            the tangent part counts. None for none.
+        params: the parameters of the reaction, a pytree.
+        symmetry: n where the state is the n-th power, in the frames, of a field that looks the same after a turn by
+            1/n: see `connection`.
+
+    Source: Chen, Chi and Wu, arXiv 0907.1817, who announce vector-valued data; the operator as of `vector_laplacian`.
+    """
+
+    diffusivity: Float[Array, "*S"] | float = 1.0
+    reaction: Reaction | None = None
+    params: Any = None
+    symmetry: int = eqx.field(static=True, default=1)
+
+    def rate(self, t, surface: Surface, u):
+        """The time derivative D Delta X + f(X)."""
+        return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
+
+    def implicit_rate(self, t, surface: Surface, u):
+        """D Delta X."""
+        del t
+        # Of a surface that stays, XLA weighs the connection once for all steps.
+        diffused = from_frame(surface, connection(surface, self.symmetry)(to_frame(surface, u)))
+        return self.diffusivities(u)[None] * diffused
+
+    def explicit_rate(self, t, surface: Surface, u):
+        """The tangent part of the reaction."""
+        del t
+        if self.reaction is None:
+            return jnp.zeros_like(u)
+        reaction = self.reaction
+        rate = jnp.asarray(jax.vmap(lambda X: reaction(X, self.params))(u), u.dtype)
+        if rate.shape != u.shape:
+            raise ValueError(
+                f"Expected a reaction that returns the shape it is given, {u.shape[1:]}, found {rate.shape[1:]}."
+            )
+        return tangential(surface, rate)
+
+    def diffusivities(self, u):
+        """D for every component of every field."""
+        numbers = jnp.asarray(self.diffusivity, u.dtype)
+        return jnp.broadcast_to(numbers.reshape(*numbers.shape, 1), u.shape[1:])
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether there is no reaction."""
+        return self.reaction is None
+
+    def spectral_bound(self, t, surface: Surface, u):
+        """The largest diffusivity times the Laplacian's bound, which is the vector Laplacian's too, and the largest row
+        sum of the reaction's Jacobian."""
+        bound = jnp.max(jnp.abs(self.diffusivities(u))) * spectral_bound(surface)
+        if self.reaction is None:
+            return bound
+        flat = u.reshape(len(u), -1)
+        directions = jnp.eye(flat.shape[1], dtype=u.dtype)
+        rate = lambda u: self.explicit_rate(t, surface, u)  # noqa: E731
+        columns = [
+            jax.jvp(rate, (u,), (jnp.broadcast_to(unit[None], flat.shape).reshape(u.shape),))[1] for unit in directions
+        ]
+        return bound + jnp.max(sum(jnp.abs(column) for column in columns))

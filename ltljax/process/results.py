@@ -1,0 +1,167 @@
+"""What a command leaves behind: a folder in which nothing of the user's is replaced.
+
+What enters: numbers, colours and pictures of a `Subject`, in the order of its mesh. What leaves: files, in the order of
+the mesh file.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .subject import Subject
+
+_NO_PICTURES = 'note: pictures need the extra "viz": pip install "ltljax[viz]"'
+# Of the values in a picture, in percent, how many lie within the colours: the few that stand out, which curvature has
+# more of, would wash out the rest.
+_SHOWN, _SHOWN_ABOUT_ZERO = 98, 90
+
+
+class Results:
+    """The folder of a command, which is made and marked with the first file.
+
+    Args:
+        command: its name, with which the names of all files begin.
+        subject: what it works on.
+        out: the folder, which may be absent.
+        pictures: the names of the pictures, which follow the command's.
+        inputs: the files that are read beside the mesh.
+
+    Raises:
+        OutputError: results would replace what is read, or what no such command has written.
+    """
+
+    def __init__(self, command: str, subject: Subject, out: Path, pictures: Sequence[str], inputs: Sequence[Path] = ()):
+        from ..output import folder
+        from ..output.pictures import can_draw
+
+        self.command, self.subject, self.out = command, subject, out
+        self.files: list[str] = []
+        self.draws = can_draw()
+        names = [f"{command}.{ending}" for ending in ("ply", "vtp", "obj")]
+        names += [f"textured/{command}.{ending}" for ending in ("obj", "mtl", "png")]
+        names += [self._picture(name) for name in pictures]
+        folder.check_results(out, self.marker, names, (*inputs, *([subject.path] if subject.path else [])))
+        mesh = subject.mesh
+        self.vertices = subject.in_file_order(mesh.vertices)
+        self.faces = np.argsort(mesh.source_order)[mesh.faces].astype(np.int32)
+        print(f"{command} on {subject.name}: {mesh.num_vertices} vertices, {mesh.num_faces} faces")
+
+    @property
+    def marker(self) -> str:
+        """The name of the file that says what was done."""
+        return f"{self.command}.json"
+
+    def numbers(self, fields: Mapping[str, Any], moved: np.ndarray | None = None) -> None:
+        """Write fields (V,) or (V, C) as VTP, on moved vertices if there are such."""
+        from ..output.files import write_vtp
+
+        ordered = {name: self.subject.in_file_order(np.asarray(values)) for name, values in fields.items()}
+        write_vtp(self._new(f"{self.command}.vtp"), self._placed(moved), self.faces, ordered)
+
+    def colors(self, colors: np.ndarray, moved: np.ndarray | None = None) -> None:
+        """Write the mesh as PLY with colours (V, 3) or (V, 4) of unsigned bytes."""
+        from ..output.files import write_ply
+
+        write_ply(self._new(f"{self.command}.ply"), self._placed(moved), self.faces, self.subject.in_file_order(colors))
+
+    def shape(self, moved: np.ndarray) -> None:
+        """Write moved vertices and the faces as OBJ, with the UV map if there is one."""
+        from ..output.files import write_obj
+
+        write_obj(self._new(f"{self.command}.obj"), self._placed(moved), self.faces, self.subject.mesh.uv)
+
+    def textured(self, image: np.ndarray) -> None:
+        """Write the mesh as OBJ with an image (H, W, 3) of unsigned bytes; nothing where no image can be written."""
+        from ..output.texture import write_textured_obj
+
+        uv = self.subject.mesh.uv
+        if self.draws and uv is not None:
+            path = self._new(f"textured/{self.command}.obj")
+            write_textured_obj(path, self.vertices, self.faces, uv, image)
+
+    def picture(
+        self,
+        name: str,
+        values: np.ndarray,
+        title: str = "",
+        limits: tuple[float, float] | None = None,
+        colormap: str | np.ndarray = "viridis",
+        moved: np.ndarray | None = None,
+    ) -> None:
+        """Draw a field (V,) between limits, or without them colours (V, 3); nothing where nothing can be drawn."""
+        from ..output import pictures
+
+        if not self.draws:
+            return
+        caption = " ".join(part for part in (self.subject.name, self.command, name) if part)
+        drawn = pictures.Picture(self._placed(moved), self.faces, title or "colours", limits, colormap)
+        image = drawn.draw(self.subject.in_file_order(values), caption)
+        drawn.close()
+        self.image(name, image)
+
+    def image(self, name: str, image: np.ndarray) -> None:
+        """Write pixels as PNG; nothing where none can be written."""
+        from ..output.pictures import write_png
+
+        if self.draws:
+            write_png(self._new(self._picture(name)), image)
+
+    def finish(self, options: Mapping[str, Any], measured: Mapping[str, Any]) -> None:
+        """Write the record, and say in short what came out."""
+        for name, value in measured.items():
+            if value is None:
+                continue
+            print(f"{name.replace('_', ' '):32} {_readable(value)}")
+        if not self.draws:
+            print(_NO_PICTURES)
+        self._mark(options, measured)
+        print(f"{'written to':32} {self.out}: {', '.join([*self.files, self.marker])}")
+
+    def _mark(self, options: Mapping[str, Any], measured: Mapping[str, Any]) -> None:
+        record = dict(
+            command=self.command,
+            mesh=self.subject.name,
+            options=dict(options),
+            measured=dict(measured),
+            files=self.files,
+            versions={package: version(package) for package in ("ltljax", "jax", "numpy")},
+        )
+        (self.out / self.marker).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+    def _new(self, name: str) -> Path:
+        """Where a file goes."""
+        path = self.out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not self.files:
+            # First of all, so that what is left of an interrupted command may be replaced.
+            self._mark({}, {})
+        self.files.append(name)
+        return path
+
+    def _picture(self, name: str) -> str:
+        return f"{self.command}-{name}.png" if name else f"{self.command}.png"
+
+    def _placed(self, moved: np.ndarray | None) -> np.ndarray:
+        return self.vertices if moved is None else self.subject.in_file_order(moved)
+
+
+def symmetric(*fields: np.ndarray) -> tuple[float, float]:
+    """Limits about zero between which most of the values lie."""
+    most = max(float(np.percentile(np.abs(values), _SHOWN_ABOUT_ZERO)) for values in fields)
+    return (-most, most) if most > 0 else (-1.0, 1.0)
+
+
+def usual(values: np.ndarray) -> tuple[float, float]:
+    """Limits between which most of the values lie."""
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [50 - _SHOWN / 2, 50 + _SHOWN / 2])
+    margin = 1e-3 * max(abs(low), abs(high), 1e-12)
+    return (float(low), float(high)) if high - low > margin else (float(low - margin), float(high + margin))
+
+
+def _readable(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

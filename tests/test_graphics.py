@@ -1,0 +1,436 @@
+"""Graphics: shapes that are smoothed as they should be, lines that stay on lines, and pictures of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ltljax as ltl
+from ltljax import imaging
+from ltljax.imaging.views import look
+
+# Of noisy meshes, which have a few.
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+
+
+def tangent(surface, X):
+    return X - jnp.sum(X * surface.normals, axis=1, keepdims=True) * surface.normals
+
+
+def rotation(surface):
+    """The rotation about the third axis."""
+    x, y, z = surface.vertices.T
+    return tangent(surface, jnp.stack([-y, x, 0 * z], axis=1))
+
+
+def noisy(mesh, amount=0.2):
+    """A mesh with noise along its normals, in mean edge lengths."""
+    normals = np.asarray(ltl.Surface.from_mesh(mesh).normals)
+    shift = amount * mesh.mesh_size * np.random.default_rng(0).normal(size=(mesh.num_vertices, 1))
+    return ltl.Mesh(mesh.vertices + shift * normals, mesh.faces)
+
+
+def face_normals(vertices, faces):
+    a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
+    across = np.cross(b - a, c - a)
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+def degrees_between(one, other):
+    return np.degrees(np.arccos(np.clip(np.sum(one * other, axis=1), -1, 1)))
+
+
+def cube(n):
+    """The unit cube with n squares along each edge."""
+    t = np.linspace(0, 1, n + 1)
+    u, v = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
+    k = np.arange(len(u)).reshape(n + 1, n + 1)
+    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    out = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    vertices, faces = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            points = np.zeros((len(u), 3))
+            points[:, axis], points[:, (axis + 1) % 3], points[:, (axis + 2) % 3] = side, u, v
+            faces.append((out if side else out[:, ::-1]) + len(u) * len(vertices))
+            vertices.append(points)
+    vertices, faces = np.concatenate(vertices), np.concatenate(faces)
+    _, first, which = np.unique(np.round(n * vertices).astype(int), axis=0, return_index=True, return_inverse=True)
+    return ltl.Mesh(vertices[first], which.ravel()[faces])
+
+
+SPHERES = {
+    "icosphere": lambda: ltl.shapes.icosphere(3, radius=2.0),
+    "jittered": lambda: ltl.shapes.jittered_sphere(3, 0.3, seed=0).scaled(2.0),
+    "fine": lambda: ltl.shapes.icosphere(4, radius=2.0),
+    "random": lambda: ltl.shapes.random_sphere(642, seed=0).scaled(2.0),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["icosphere", "jittered", *(pytest.param(name, marks=pytest.mark.slow) for name in ("fine", "random"))]
+)
+def test_a_sphere_shrinks_by_mean_curvature_as_it_should(name):
+    surface = ltl.Surface.from_mesh(SPHERES[name]())
+    radii = jnp.linalg.norm(imaging.mean_curvature_flow(surface, 0.75), axis=1)
+    np.testing.assert_allclose(radii, np.sqrt(4 - 4 * 0.75), rtol=2.5e-3)
+
+
+def test_mean_curvature_flow_is_second_order_in_time():
+    surface = ltl.Surface.from_mesh(SPHERES["icosphere"]())
+    once = imaging.mean_curvature_flow(surface, 0.75)
+    half = surface.with_vertices(imaging.mean_curvature_flow(surface, 0.375))
+    twice = imaging.mean_curvature_flow(half, 0.375)
+    errors = [float(jnp.abs(jnp.mean(jnp.linalg.norm(x, axis=1)) - 1)) for x in (once, twice)]
+    assert np.log2(errors[0] / errors[1]) > 1.8
+    assert errors[1] < 5e-4
+
+
+def test_a_flow_beyond_the_collapse_is_said():
+    with pytest.raises(ltl.SolveError, match="collapsed"):
+        imaging.mean_curvature_flow(ltl.Surface.from_mesh(SPHERES["icosphere"]()), 1.2)
+
+
+@pytest.mark.slow
+def test_mean_curvature_flow_in_single_precision_is_as_accurate():
+    surface = ltl.Surface.from_mesh(SPHERES["icosphere"](), dtype=jnp.float32)
+    found = imaging.mean_curvature_flow(surface, 0.75)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(jnp.linalg.norm(found, axis=1), 1, rtol=2.5e-3)
+
+
+@pytest.mark.parametrize("way", ["fair", pytest.param("flow", marks=pytest.mark.slow)])
+def test_boundaries_stay_where_they_are(way):
+    mesh = ltl.shapes.disk(rings=8)
+    rim = mesh.boundary_vertices
+    height = 0.3 * (1 - np.sum(mesh.vertices**2, axis=1))
+    bent = ltl.Mesh(np.column_stack([mesh.vertices[:, :2], height]), mesh.faces)
+    surface = ltl.Surface.from_mesh(bent)
+    if way == "flow":
+        found = [imaging.mean_curvature_flow(surface, 0.5, steps=10)]
+    else:
+        found = [imaging.fair(surface, 10.0), imaging.fair(surface, 1.0, order=2)]
+    for x in found:
+        np.testing.assert_array_equal(x[rim], bent.vertices[rim])
+        assert jnp.max(jnp.abs(x[:, 2])) < 0.1
+
+
+@pytest.mark.parametrize("way", ["order 1", "order 2", pytest.param("flow", marks=pytest.mark.slow)])
+def test_a_noisy_bunny_is_smoothed_and_keeps_its_volume(way, real_mesh):
+    clean = ltl.load_mesh(real_mesh("bunny_closed.obj"))
+    mesh, h = noisy(clean), clean.mesh_size
+    surface = ltl.Surface.from_mesh(mesh)
+    smoothed, falls_to = {
+        "flow": lambda: (imaging.mean_curvature_flow(surface, 0.25 * h**2, steps=8, keep_volume=True), 0.8),
+        "order 1": lambda: (imaging.fair(surface, 0.25 * h**2, keep_volume=True), 0.8),
+        "order 2": lambda: (imaging.fair(surface, 0.25 * h**4, order=2, keep_volume=True), 0.7),
+    }[way]()
+    before, after = (float(imaging.enclosed_volume(x, mesh.faces)) for x in (mesh.vertices, smoothed))
+    assert abs(after / before - 1) < 1e-9
+    assert abs(after / float(imaging.enclosed_volume(clean.vertices, mesh.faces)) - 1) < 0.01
+    off = [np.sqrt(np.mean((np.asarray(x) - clean.vertices) ** 2)) for x in (mesh.vertices, smoothed)]
+    assert off[1] < falls_to * off[0]
+    reference = face_normals(clean.vertices, mesh.faces)
+    turned = [degrees_between(face_normals(x, mesh.faces), reference).mean() for x in (mesh.vertices, smoothed)]
+    assert turned[1] < 0.65 * turned[0]
+
+
+def test_each_component_keeps_its_own_volume():
+    one = ltl.shapes.icosphere(2)
+    size = one.num_vertices
+    mesh = ltl.Mesh(
+        np.concatenate([one.vertices, 0.5 * one.vertices + 3]), np.concatenate([one.faces, one.faces + size])
+    )
+    found = imaging.fair(ltl.Surface.from_mesh(mesh), 0.1, keep_volume=True)
+    # Without it the smaller one would lose half its size.
+    np.testing.assert_allclose(found, mesh.vertices, atol=1e-2)
+
+
+def test_fairing_divides_waves_by_what_it_says(sphere):
+    z = sphere.vertices[:, 2:]
+    # A sphere's own position is a harmonic of degree one: Delta X = -2 X.
+    np.testing.assert_allclose(imaging.fair(sphere, 0.3)[:, 2:], z / (1 + 2 * 0.3), atol=2e-3)
+    np.testing.assert_allclose(imaging.fair(sphere, 0.3, order=2)[:, 2:], z / (1 + 4 * 0.3), atol=2e-3)
+    with_multigrid = imaging.fair(sphere, 0.3, order=2, preconditioner=ltl.multigrid(sphere))
+    np.testing.assert_allclose(with_multigrid, imaging.fair(sphere, 0.3, order=2), atol=1e-8)
+    both = jax.vmap(lambda strength: imaging.fair(sphere, strength, throw=False))(jnp.array([0.3, 0.6]))
+    np.testing.assert_allclose(both[1], imaging.fair(sphere, 0.6), atol=1e-8)
+
+
+@pytest.mark.parametrize("way", ["fair", pytest.param("flow", marks=pytest.mark.slow)])
+def test_smoothed_positions_have_the_right_derivatives(sphere, way):
+    x = sphere.vertices + 0.05 * jnp.sin(3 * sphere.vertices)
+
+    def loss(p):
+        moved, amount = sphere.with_vertices(p[0]), p[1]
+        if way == "flow":
+            smooth = imaging.mean_curvature_flow(moved, amount, steps=2, keep_volume=True, throw=False)
+        else:
+            smooth = imaging.fair(moved, amount, order=2, throw=False)
+        return jnp.sum(jnp.sin(2 * smooth + 1))
+
+    found = ltl.check_gradient(loss, (x, 0.1))
+    assert found.passed, found
+
+
+def test_fairing_has_the_same_derivatives_in_both_modes(sphere):
+    def loss(strength):
+        return jnp.sum(jnp.sin(2 * imaging.fair(sphere, strength, throw=False) + 1))
+
+    np.testing.assert_allclose(jax.jvp(loss, (0.1,), (1.0,))[1], jax.grad(loss)(0.1), rtol=1e-6)
+
+
+def test_a_noisy_cube_keeps_its_edges():
+    clean = cube(12)
+    mesh, h = noisy(clean), clean.mesh_size
+    surface = ltl.Surface.from_mesh(mesh)
+    reference = face_normals(clean.vertices, mesh.faces)
+
+    def error(vertices):
+        return degrees_between(face_normals(vertices, mesh.faces), reference).mean()
+
+    fairest = min(error(imaging.fair(surface, share * h**4, order=2)) for share in (0.1, 0.3, 0.5, 1.0))
+    found = error(imaging.denoise_mesh(surface))
+    assert found < 0.25 * error(mesh.vertices)
+    assert found < 0.5 * fairest
+    assert error(imaging.denoise_mesh(surface, normal_iterations=20)) < 0.1 * error(mesh.vertices)
+
+
+@pytest.mark.slow
+def test_denoised_positions_have_the_right_derivatives(sphere):
+    x = sphere.vertices + 0.05 * jnp.sin(7 * sphere.vertices)
+
+    def loss(p):
+        return jnp.sum(imaging.denoise_mesh(sphere.with_vertices(p[0]), p[1], normal_iterations=2) ** 3)
+
+    found = ltl.check_gradient(loss, (x, 0.35))
+    assert found.passed, found
+
+
+@pytest.mark.parametrize("make", [ltl.shapes.icosphere, lambda n: ltl.shapes.jittered_sphere(n, 0.5, seed=0)])
+def test_field_lines_of_a_rotation_stay_on_circles_to_second_order(make):
+    errors = []
+    for level in (3, 5):
+        surface = ltl.Surface.from_mesh(make(level))
+        inside = np.flatnonzero(np.abs(np.asarray(surface.vertices)[:, 2]) < 0.95)
+        seeds = np.random.default_rng(0).choice(inside, 64, replace=False)
+        lines = imaging.streamlines(surface, rotation(surface), seeds, 2 * np.pi)
+        assert lines.is_valid.all()
+        heights = lines.points[..., 2] / jnp.linalg.norm(lines.points, axis=-1)
+        errors.append(float(jnp.sqrt(jnp.mean((heights - heights[:, :1]) ** 2))))
+    assert np.log2(errors[0] / errors[1]) / 2 > 1.9
+    assert errors[-1] < 4e-5
+
+
+def test_lines_end_at_boundaries_and_at_zeros_of_the_field():
+    mesh = ltl.shapes.jittered(ltl.shapes.disk(rings=8), 0.2, seed=0)
+    surface = ltl.Surface.from_mesh(mesh)
+    seeds = np.flatnonzero(np.hypot(*mesh.vertices[:, :2].T) < 0.5)[:20]
+    to_right = jnp.zeros_like(surface.vertices).at[:, 0].set(1)
+    lines = imaging.streamlines(surface, to_right, seeds, 2.0, 0.1)
+    here = surface.vertices[seeds]
+    way = jnp.linspace(0, 2, 21)
+    straight = here[:, None] + way[None, :, None] * jnp.array([1.0, 0, 0]).reshape(1, 1, 3)
+    np.testing.assert_allclose(jnp.where(lines.is_valid[..., None], lines.points - straight, 0), 0, atol=1e-8)
+    np.testing.assert_allclose(lines.points[..., 1], jnp.broadcast_to(here[:, None, 1], (20, 21)), atol=1e-8)
+    room = jnp.sqrt(1 - here[:, 1] ** 2) - here[:, 0]
+    np.testing.assert_allclose(jnp.sum(lines.is_valid, axis=1), jnp.floor(room / 0.1) + 1, atol=1)
+    assert not lines.is_valid[:, -1].any()
+    # To the left of the middle there is nothing to follow.
+    half = jnp.where(surface.vertices[:, :1] < 0, 0, to_right)
+    ended = imaging.streamlines(surface, half, seeds, 2.0, 0.1)
+    is_left = mesh.vertices[seeds, 0] < -0.3
+    assert not ended.is_valid[is_left, 1:].any()
+    np.testing.assert_allclose(ended.points[is_left, -1], here[is_left], atol=1e-6)
+
+
+def test_lines_without_direction_go_on_the_way_they_came_also_around_sharp_edges():
+    mesh = cube(6)
+    surface = ltl.Surface.from_mesh(mesh)
+    normals = surface.normals
+    X = jnp.stack([-normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
+    sides = np.linalg.norm(np.asarray(X), axis=1) > 0.9
+    heights = mesh.vertices[:, 2]
+    seeds = np.flatnonzero(sides & (heights > 0.2) & (heights < 0.8))[:30]
+    directed = imaging.streamlines(surface, X, seeds, 4.0, 0.05)
+    assert directed.is_valid.all()
+    np.testing.assert_allclose(directed.points[..., 2], np.tile(heights[seeds, None], 81), atol=1e-8)
+    np.testing.assert_allclose(directed.points[:, -1], directed.points[:, 0], atol=1e-6)
+    flips = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], size=(mesh.num_vertices, 1)))
+    lines = imaging.streamlines(surface, flips * X, seeds, 4.0, 0.05, is_directed=False)
+    other = imaging.streamlines(surface, -X, seeds, 4.0, 0.05)
+    same = jnp.where((flips[seeds] > 0)[:, :, None], directed.points, other.points)
+    np.testing.assert_allclose(lines.points, same, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_lines_have_derivatives_in_the_field_and_means_along_them_in_forward_mode(sphere):
+    x = sphere.vertices
+    seeds = (jnp.arange(10), jnp.full((10, 3), 1 / 3))
+
+    def loss(turn):
+        X = tangent(sphere, jnp.stack([-x[:, 1], x[:, 0], turn + 0.3 * x[:, 0]], axis=1))
+        return jnp.sum(jnp.sin(imaging.streamlines(sphere, X, seeds, 0.7, 0.1).points))
+
+    found = ltl.check_gradient(loss, 0.3, step=1e-3)
+    assert found.passed, found
+
+    def smeared(noise):
+        return imaging.line_integral_convolution(sphere, rotation(sphere), noise=noise, window="box")
+
+    # Linear, and so its own derivative.
+    noise = jax.random.normal(jax.random.key(1), (sphere.num_vertices,))
+    np.testing.assert_allclose(jax.jvp(smeared, (noise,), (noise,))[1], smeared(noise), atol=1e-12)
+
+
+def test_line_integral_convolution_shows_circles():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(5))
+    X = rotation(surface)
+    u = imaging.line_integral_convolution(surface, X)
+    slope = ltl.gradient(surface, u)
+    steepness = jnp.linalg.norm(slope, axis=1)
+    speed = jnp.linalg.norm(X, axis=1)
+    along = jnp.abs(jnp.sum(slope * X, axis=1)) / jnp.maximum(steepness * speed, 1e-12)
+    off = jnp.degrees(jnp.arcsin(jnp.clip(along, 0, 1)))
+    weight = jnp.where(speed > 0.05, steepness, 0)
+    assert jnp.sum(off * weight) / jnp.sum(weight) < 8
+    # Where it is not too small to have a direction: seven vertices of eight.
+    assert jnp.mean(off[weight > 0.25 * jnp.mean(steepness)]) < 10
+
+
+def test_a_picture_shows_circles(tmp_path):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4), dtype=jnp.float32)
+    pytest.importorskip("imageio")
+    path = tmp_path / "lines.png"
+    image, mask = imaging.lic_picture(surface, rotation(surface), path, view=(0, 0, 1), resolution=300)
+    assert path.stat().st_size > 10_000
+    assert image.shape == mask.shape == (300, 300)
+    assert image.dtype == np.uint8
+    assert (image[~mask] == 255).all()
+    radius = 300 * (1 - 2 * 0.04) / 2
+    assert abs(mask.sum() / (np.pi * radius**2) - 1) < 0.01
+    row, column = np.mgrid[:300, :300]
+    x, y = (column - 149.5) / radius, (149.5 - row) / radius
+    down, right = np.gradient(image.astype(float))
+    steepness, r = np.hypot(down, right), np.hypot(x, y)
+    # At the rim pixels see the circles too steeply from the side, at the pole circles are smaller than pixels.
+    shown = (r < 0.9) & (r > 0.05)
+    off = np.degrees(np.arcsin(np.clip(np.abs(-y * right - x * down) / np.maximum(steepness * r, 1e-12), 0, 1)))
+    assert np.sum((off * steepness)[shown]) / np.sum(steepness[shown]) < 10
+    assert off[shown & (steepness > 0.5 * steepness[shown].mean())].mean() < 10
+
+
+def test_the_mean_along_lines_is_linear_in_the_noise_and_has_its_derivatives(sphere):
+    X, noise = rotation(sphere), jax.random.normal(jax.random.key(1), (sphere.num_vertices,))
+
+    def smeared(noise):
+        return imaging.line_integral_convolution(sphere, X, noise=noise)
+
+    np.testing.assert_allclose(smeared(0 * noise + 3), 3, rtol=1e-12)
+    found = ltl.check_gradient(lambda noise: jnp.sum(smeared(noise) ** 2), noise)
+    assert found.passed, found
+    # A function of the height is the same all along a line.
+    heights = sphere.vertices[:, 2]
+    inside = jnp.abs(heights) < 0.9
+    np.testing.assert_allclose(jnp.where(inside, smeared(heights) - heights, 0), 0, atol=0.03)
+
+
+def test_points_inside_faces_take_a_solid_noise_in_the_surface_s_own_float():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), dtype=jnp.float32)
+    points = (jnp.arange(50), jnp.full((50, 3), 1 / 3))
+    found = imaging.line_integral_convolution(surface, rotation(surface), points=points)
+    assert found.shape == (50,)
+    assert found.dtype == jnp.float32
+    assert 0 < found.min() < found.max() < 1
+    noise = imaging.solid_noise(jax.random.key(2), 0.1)
+    other = imaging.line_integral_convolution(surface, rotation(surface), noise=noise, points=points)
+    assert not jnp.allclose(found, other)
+    for x in (imaging.fair(surface, 0.1, keep_volume=True), imaging.denoise_mesh(surface)):
+        assert x.dtype == jnp.float32
+        assert jnp.isfinite(x).all()
+
+
+def test_a_view_sees_the_nearest_face():
+    front = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    behind = 2 * front * np.array([1, 1, -1])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    seen = look(np.concatenate([front, behind]), faces, (0, 0, 1), (0, 1, 0), 50)
+    at = np.einsum("nk,nkc->nc", seen.weights, np.concatenate([front, behind])[faces[seen.face]])
+    row, column = np.nonzero(seen.mask)
+    np.testing.assert_allclose(at[:, 0], (column - 24.5) * seen.pixel, atol=1e-9)
+    np.testing.assert_allclose(at[:, 1], (24.5 - row) * seen.pixel, atol=1e-9)
+    is_front = (np.abs(at[:, :2]) < 1 + 1e-9).all(axis=1)
+    np.testing.assert_allclose(at[:, 2], np.where(is_front, 1, -2), atol=1e-9)
+
+
+def test_ridges_and_valleys_lie_where_a_sheet_bends_most():
+    mesh = ltl.shapes.jittered(ltl.shapes.square(n=40), 0.1, seed=0)
+    x, y, _ = mesh.vertices.T
+    centre, away = x.mean(), np.abs(x - x.mean())
+    inside = (away < 0.4) & (np.abs(y - y.mean()) < 0.4)
+    for sign, kind in ((-1, "ridge"), (1, "valley")):
+        z = sign * np.sqrt((x - centre) ** 2 + 0.15**2)
+        found = imaging.ridges(ltl.Surface.from_mesh(ltl.Mesh(np.stack([x, y, z], axis=1), mesh.faces)))
+        shown, other = (np.asarray(a) for a in (found.ridge, found.valley)[::-sign])
+        assert 0 <= shown.min() < shown.max() <= 1
+        assert shown[inside & (away < 0.01)].min() > 0.5, kind
+        assert shown[inside & (away > 0.1)].max() < 0.1, kind
+        assert other[inside].max() < 0.1, kind
+
+
+def test_the_shape_index_of_known_shapes():
+    index = imaging.shape_index(ltl.Surface.from_mesh(ltl.shapes.icosphere(3)))
+    np.testing.assert_allclose(index, 1, atol=0.02)
+    mesh = ltl.shapes.torus(2.0, 1.0, 48, 24)
+    index = np.asarray(imaging.shape_index(ltl.Surface.from_mesh(mesh)))
+    out = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1])
+    k = np.stack([np.ones(len(out)), (out - 2) / out])
+    np.testing.assert_allclose(index, 2 / np.pi * np.arctan2(k[0] + k[1], k[0] - k[1]), atol=0.05)
+
+
+def test_what_cannot_be_smoothed_or_drawn_is_said(sphere):
+    disk = ltl.Surface.from_mesh(ltl.shapes.disk(rings=3))
+    X, cases = rotation(sphere), []
+    for smooth in (imaging.mean_curvature_flow, imaging.fair):
+        cases += [
+            (lambda smooth=smooth: smooth(disk, 0.1, keep_volume=True), "closed surface .* found 1 boundary loop,"),
+            (lambda smooth=smooth: smooth(sphere, 0.0), "positive .* found 0"),
+            (lambda smooth=smooth: smooth(sphere, -1.0), "positive .* found -1"),
+        ]
+    for draw in (
+        imaging.line_integral_convolution,
+        imaging.lic_picture,
+        lambda surface, X: imaging.streamlines(surface, X, jnp.array([0]), 1.0),
+    ):
+        cases += [
+            (lambda draw=draw: draw(sphere, X[:7]), r"\(162, 3\), found shape \(7, 3\)"),
+            (lambda draw=draw: draw(sphere, X + 0.1 * sphere.normals), "vertex 0 .* Project first"),
+            (lambda draw=draw: draw(sphere, X.at[5].set(jnp.nan)), "finite vector field, .* at vertex 5"),
+        ]
+    third = jnp.full((1, 3), 1 / 3)
+    cases += [
+        (lambda: imaging.mean_curvature_flow(sphere, 0.1, steps=0), "one step, found steps=0"),
+        (lambda: imaging.denoise_mesh(sphere, 0.0), "positive similarity"),
+        (lambda: imaging.denoise_mesh(sphere, normal_iterations=0), "at least one iteration"),
+        (lambda: imaging.streamlines(sphere, X, jnp.array([0, 162]), 1.0), "0 to 161, found vertex 162 at index 1"),
+        (lambda: imaging.streamlines(sphere, X, jnp.array([-1]), 1.0), "found vertex -1 at index 0"),
+        (lambda: imaging.streamlines(sphere, X, (jnp.array([320]), third), 1.0), "0 to 319, found face 320"),
+        (lambda: imaging.streamlines(sphere, X, (jnp.array([0]), 2 * third), 1.0), "sum to one, found"),
+        (lambda: imaging.streamlines(sphere, X, jnp.array([0]), -1.0), "positive length and step, found -1.0"),
+        (lambda: imaging.line_integral_convolution(sphere, X, length=0.0), "positive length and step, found 0.0"),
+        (lambda: imaging.line_integral_convolution(sphere, X, noise=jnp.ones(5)), r"\(162,\), found \(5,\)"),
+        (lambda: imaging.lic_picture(sphere, X, view=(0, 1, 0)), "not along up"),
+        (lambda: imaging.lic_picture(sphere, X, resolution=0), "positive resolution, found 0"),
+        (lambda: imaging.lic_picture(sphere, X, shading=2.0), "from 0 to 1, found 2.0"),
+    ]
+    for call, message in cases:
+        with pytest.raises(ValueError, match=message):
+            call()
+    traced = jax.jit(lambda x: imaging.line_integral_convolution(sphere.with_vertices(x), X))
+    with pytest.raises(ValueError, match="Give step= and length="):
+        traced(sphere.vertices)
