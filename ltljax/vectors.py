@@ -228,18 +228,19 @@ def lie_derivative(surface: Surface, X: Float[AnyArray, "V 3"], u: Float[AnyArra
         X: (V, 3).
         u: (V,) or (V, S), numbers.
     """
-    check_vectors(surface, X)
+    _check_one(surface, X)
     return jnp.einsum("vc,v...c->v...", X, gradient(surface, u))
 
 
 @eqx.filter_jit
 def lie_bracket(surface: Surface, X: Float[AnyArray, "V 3"], Y: Float[AnyArray, "V 3"]) -> Float[Array, "V 3"]:
     """[X, Y], the derivative of Y along X less that of X along Y: zero where their flows commute."""
+    _check_one(surface, X)
+    _check_one(surface, Y)
     along = jnp.einsum("vcd,vd->vc", covariant_derivative(surface, Y), X)
     return along - jnp.einsum("vcd,vd->vc", covariant_derivative(surface, X), Y)
 
 
-@eqx.filter_jit
 def transport_along(
     surface: Surface, path: Int[AnyArray, " n"], vector: Float[AnyArray, "*S 3"]
 ) -> Float[Array, "n *S 3"]:
@@ -250,15 +251,29 @@ def transport_along(
 
     Args:
         surface: the surface.
-        path: vertices, each the neighbour of the one before.
+        path: vertices, each near the one before.
         vector: (3,) or (S, 3) at the first of them; the tangent part counts.
+
+    Raises:
+        ValueError: the vector has another shape, or the path leaves the surface.
 
     Source: the parallel transport L of Chen, Chi and Wu, arXiv 0907.1817, section 2.
     """
-    if vector.shape[-1:] != (3,):
-        raise ValueError(f"Expected a vector of shape (3,) or (S, 3), found {vector.shape}.")
     vector = jnp.asarray(vector, surface.dtype)
-    normals = surface.normals[jnp.asarray(path)].reshape(-1, *(1,) * (vector.ndim - 1), 3)
+    if vector.ndim not in (1, 2) or vector.shape[-1] != 3:
+        raise ValueError(f"Expected a vector of shape (3,) or (S, 3), found {vector.shape}.")
+    if not isinstance(path, Tracer):
+        path = np.asarray(path)
+        is_off = (path < 0) | (path >= surface.num_vertices)
+        if path.ndim != 1 or not path.size or is_off.any():
+            found = path[is_off][0] if is_off.any() else f"shape {path.shape}"
+            raise ValueError(f"Expected a path of vertices from 0 to {surface.num_vertices - 1}, found {found}.")
+    return _carried(surface, jnp.asarray(path), vector)
+
+
+@eqx.filter_jit
+def _carried(surface: Surface, path: Array, vector: Array) -> Array:
+    normals = surface.normals[path].reshape(-1, *(1,) * (vector.ndim - 1), 3)
 
     def step(vector, planes):
         source, target = planes
@@ -285,6 +300,7 @@ def singularities(surface: Surface, X: Float[AnyArray, "V 3"], symmetry: int = 1
     Source: Knoppel, Crane, Pinkall and Schroder (2013), Globally optimal direction fields,
     doi:10.1145/2461912.2462005, section 6.
     """
+    _check_one(surface, X)
     z, corners = to_frame(surface, X), surface.faces
     normals, frames = surface.normals, surface.geometry.frames
 
@@ -308,6 +324,11 @@ def check_vectors(surface: Surface, X: AnyArray) -> None:
         raise ValueError(
             f"Expected vectors of shape ({surface.num_vertices}, 3) or ({surface.num_vertices}, S, 3), found {X.shape}."
         )
+
+
+def _check_one(surface: Surface, X: AnyArray) -> None:
+    if X.shape != (surface.num_vertices, 3):
+        raise ValueError(f"Expected one field of shape ({surface.num_vertices}, 3), found {X.shape}.")
 
 
 def check_tangent(surface: Surface, X: AnyArray) -> None:

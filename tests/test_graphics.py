@@ -7,6 +7,7 @@ import pytest
 
 import ltljax as ltl
 from ltljax import imaging
+from ltljax.imaging.tracing import mean_edge
 from ltljax.imaging.views import look
 
 # Of noisy meshes, which have a few.
@@ -94,6 +95,18 @@ def test_mean_curvature_flow_is_second_order_in_time():
 def test_a_flow_beyond_the_collapse_is_said():
     with pytest.raises(ltl.SolveError, match="collapsed"):
         imaging.mean_curvature_flow(ltl.Surface.from_mesh(SPHERES["icosphere"]()), 1.2)
+
+
+def test_a_shape_that_was_not_found_is_no_number(sphere):
+    flow = jax.jit(lambda time: imaging.mean_curvature_flow(sphere, time, steps=4))
+    assert jnp.isnan(flow(0.5)).all()
+    assert jnp.isfinite(flow(0.01)).all()
+    assert jnp.isnan(imaging.mean_curvature_flow(sphere, 0.5, steps=4, throw=False)).all()
+    fair = jax.jit(lambda strength: imaging.fair(sphere, strength))
+    assert jnp.isnan(fair(jnp.inf)).all()
+    assert jnp.isfinite(fair(0.1)).all()
+    with pytest.raises(ltl.SolveError, match="not solved"):
+        imaging.fair(sphere, jnp.inf)
 
 
 @pytest.mark.slow
@@ -201,6 +214,24 @@ def test_a_noisy_cube_keeps_its_edges():
     assert error(imaging.denoise_mesh(surface, normal_iterations=20)) < 0.1 * error(mesh.vertices)
 
 
+def test_edges_of_a_cube_stay_or_go_with_the_similarity_that_is_said():
+    clean = cube(12)
+    mesh = noisy(clean)
+    surface = ltl.Surface.from_mesh(mesh)
+    reference, corners = face_normals(clean.vertices, mesh.faces), clean.vertices[mesh.faces]
+    # With two corners on two sides each.
+    is_beside = (np.sum((corners < 1e-9) | (corners > 1 - 1e-9), axis=2) > 1).sum(axis=1) > 1
+    before, beside = float(imaging.enclosed_volume(mesh.vertices, mesh.faces)), {}
+    for similarity in (0.3, 0.4, 0.5, 0.7):
+        x = imaging.denoise_mesh(surface, similarity, normal_iterations=20)
+        beside[similarity] = degrees_between(face_normals(x, mesh.faces), reference)[is_beside].mean()
+        if similarity < 0.5:
+            assert abs(float(imaging.enclosed_volume(x, mesh.faces)) / before - 1) < 1e-3
+    assert max(beside[0.3], beside[0.4]) < 3
+    assert 4 < beside[0.5] < 15
+    assert beside[0.7] > 20
+
+
 @pytest.mark.slow
 def test_denoised_positions_have_the_right_derivatives(sphere):
     x = sphere.vertices + 0.05 * jnp.sin(7 * sphere.vertices)
@@ -225,6 +256,21 @@ def test_field_lines_of_a_rotation_stay_on_circles_to_second_order(make):
         errors.append(float(jnp.sqrt(jnp.mean((heights - heights[:, :1]) ** 2))))
     assert np.log2(errors[0] / errors[1]) / 2 > 1.9
     assert errors[-1] < 4e-5
+
+
+@pytest.mark.parametrize("share", [0.5, 6, 40])
+def test_lines_go_their_length_however_long_a_step_is(share):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
+    X, x = rotation(surface), surface.vertices
+    step = share * mean_edge(surface)
+    seeds = jnp.argsort(jnp.abs(x[:, 2]))[:40]
+    lines = imaging.streamlines(surface, X, seeds, 2.0, step)
+    assert lines.is_valid.all()
+    ends = x[seeds] @ jnp.array([[np.cos(2), np.sin(2), 0], [-np.sin(2), np.cos(2), 0], [0, 0, 1]])
+    np.testing.assert_allclose(lines.points[:, -1], ends, atol=0.02)
+    smeared = imaging.line_integral_convolution(surface, X, noise=x[:, 0], length=2.0, step=step, window="box")
+    # The mean of cos(angle + s) over s from -2 to 2.
+    np.testing.assert_allclose(smeared[seeds], np.sin(2) / 2 * x[seeds, 0], atol=0.01)
 
 
 def test_lines_end_at_boundaries_and_at_zeros_of_the_field():
@@ -409,8 +455,8 @@ def test_what_cannot_be_smoothed_or_drawn_is_said(sphere):
     ):
         cases += [
             (lambda draw=draw: draw(sphere, X[:7]), r"\(162, 3\), found shape \(7, 3\)"),
-            (lambda draw=draw: draw(sphere, X + 0.1 * sphere.normals), "vertex 0 .* Project first"),
-            (lambda draw=draw: draw(sphere, X.at[5].set(jnp.nan)), "finite vector field, .* at vertex 5"),
+            (lambda draw=draw: draw(sphere, X + 0.1 * sphere.normals), "vertex 0 .* tangential"),
+            (lambda draw=draw: draw(sphere, X.at[5].set(jnp.nan)), "finite vectors, .* at vertex 5"),
         ]
     third = jnp.full((1, 3), 1 / 3)
     cases += [
@@ -427,6 +473,9 @@ def test_what_cannot_be_smoothed_or_drawn_is_said(sphere):
         (lambda: imaging.lic_picture(sphere, X, view=(0, 1, 0)), "not along up"),
         (lambda: imaging.lic_picture(sphere, X, resolution=0), "positive resolution, found 0"),
         (lambda: imaging.lic_picture(sphere, X, shading=2.0), "from 0 to 1, found 2.0"),
+        (lambda: imaging.lic_picture(sphere, X, length=0.0), "positive length of the lines, found 0.0"),
+        (lambda: imaging.ridges(sphere, 0.0), "width to be finite and positive, found 0"),
+        (lambda: imaging.ridges(sphere, -1.0), "width to be finite and positive, found -1"),
     ]
     for call, message in cases:
         with pytest.raises(ValueError, match=message):

@@ -9,6 +9,7 @@ import pytest
 
 import ltljax as ltl
 from ltljax import imaging
+from ltljax.imaging import minimiser
 from ltljax.imaging.minimiser import Faces, Functional
 from ltljax.imaging.signals import spacing
 from ltljax.imaging.variation import flatness
@@ -259,6 +260,23 @@ def test_unit_vectors_stay_unit(spot, time):
         d = d / np.linalg.norm(d, axis=1, keepdims=True)
         after = imaging.diffuse_directions(spot.surface, d, time * spot.edge**2)
         assert np.abs(np.linalg.norm(after, axis=1) - 1).max() < 1e-12
+        # All within a half space, the nearest to its rim 0.1 inside: a mean of them is no nearer.
+        within = np.column_stack([d[:, :-1], np.abs(d[:, -1]) + 0.2])
+        within /= np.linalg.norm(within, axis=1, keepdims=True)
+        after = np.asarray(imaging.diffuse_directions(spot.surface, within, time * spot.edge**2))
+        assert after[:, -1].min() > within[:, -1].min() - 1e-9
+
+
+def test_directions_have_a_derivative_in_time_from_its_beginning(sphere):
+    surface, d = sphere.surface, jnp.asarray(sphere.x)[:, jnp.array([1, 2, 0])]
+    d = d + 0.3 * d**2
+    d = d / jnp.linalg.norm(d, axis=1, keepdims=True)
+    found = jax.jacfwd(lambda time: imaging.diffuse_directions(surface, d, time))(jnp.zeros(()))
+    rate = ltl.laplacian(surface, d)
+    # Of the Laplacian the part across the direction.
+    np.testing.assert_allclose(found, rate - d * jnp.sum(d * rate, axis=1, keepdims=True), atol=1e-8)
+    slope = jax.grad(lambda time: jnp.sum(imaging.diffuse_directions(surface, d, time) ** 3))(jnp.zeros(()))
+    np.testing.assert_allclose(slope, jnp.sum(3 * d**2 * found), rtol=1e-6)
 
 
 def test_the_flow_of_directions_is_that_of_their_angle():
@@ -298,6 +316,24 @@ def test_diffusion_that_knows_of_edges_beats_diffusion_that_does_not(spot):
     along = imaging.edge_enhancing(spot.surface, spot.noisy, edge**2, 0.1 / edge, rounds=2)
     assert spot.decibels(stopped) > linear + 2
     assert spot.decibels(along) > linear + 2
+
+
+@pytest.mark.parametrize("enhancing", ["edges", "coherence"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_tensors_have_a_derivative_where_an_image_is_flat(dtype, enhancing):
+    scene = Scene(ltl.shapes.icosphere(2), dtype)
+    u = jnp.asarray(np.maximum(scene.x[:, 2], 0), dtype)
+    weights = jnp.asarray(np.random.default_rng(12).normal(size=(len(u), 3, 3)), dtype)
+
+    def loss(u):
+        structure = imaging.structure_tensor(scene.surface, u, 0.0, 0.0)
+        return jnp.sum(weights * imaging.diffusion_tensor(scene.surface, structure, 1.0, enhancing))
+
+    slope = jax.grad(loss)(u)
+    assert jnp.isfinite(slope).all()
+    assert jnp.max(jnp.abs(slope)) > 1e-3
+    # Well inside the flat half the tensor does not change.
+    np.testing.assert_array_equal(slope[scene.x[:, 2] < -0.7], 0)
 
 
 def test_coherence_enhancing_closes_gaps_in_lines():
@@ -502,6 +538,8 @@ def test_mistakes_are_said(sphere):
             lambda: jax.jit(lambda s: imaging.anisotropic_diffusion(surface, u, s * np.ones((size, 3, 3)), 0.1))(1.0),
             "being traced",
         ),
+        (lambda: jax.jit(lambda u: imaging.edge_enhancing(surface, u, 0.1, 1.0))(u), "anew in every round"),
+        (lambda: jax.jit(lambda u: imaging.coherence_enhancing(surface, u, 0.1, 1.0))(u), "anew in every round"),
     ]
     for call, words in said:
         with pytest.raises(ValueError, match=words):
@@ -515,3 +553,35 @@ def test_what_does_not_converge_is_said_and_is_no_number_inside_jit(sphere):
         imaging.segment(sphere.surface, sphere.noisy, max_steps=1)
     inside = jax.jit(lambda u: imaging.denoise(sphere.surface, u, strength=0.1, max_steps=1))(sphere.noisy)
     assert bool(jnp.isnan(inside).all())
+
+
+def test_a_derivative_that_was_not_solved_for_is_no_number(monkeypatch):
+    scene = Scene(ltl.shapes.icosphere(2))
+    areas, u = scene.surface.vertex_areas, jnp.asarray(scene.noisy)[:, None]
+    faces, one = Faces.of(scene.surface), jnp.ones(())
+
+    def loss(f):
+        functional = Functional(faces, areas, jnp.ones_like(areas), f, 0.02 * one, 0.01 * one)
+        return jnp.sum(minimiser.minimise(functional, f, 1e-8, 100)[0] ** 3)
+
+    assert jnp.isfinite(jax.grad(loss)(u)).all()
+    monkeypatch.setattr(minimiser, "_MAX_ITERATIONS", 3)
+    value, slope = jax.value_and_grad(loss)(u)
+    assert jnp.isfinite(value)
+    assert jnp.isnan(slope).all()
+
+
+def test_a_map_that_leaves_the_image_by_rounding_reads_its_own_side():
+    square = ltl.shapes.square(n=4)
+    corners, faces = square.vertices, square.faces
+    # Columns count tens from the left, rows ones from below.
+    image = np.outer([3.0, 2, 1, 0], np.ones(4)) + 10 * np.arange(4.0)
+    exact = imaging.from_texture(ltl.Mesh(corners, faces, uv=corners[faces][..., :2]), image)
+    x, y = np.clip(4 * corners[:, :2] - 0.5, 0, 3).T
+    np.testing.assert_allclose(exact, 10 * x + y, atol=1e-12)
+    for off in (1e-6, -1e-6):
+        # Beyond the rim and inside of it; and the same one image further.
+        uv = 0.5 + (1 + off) * (corners[faces][..., :2] - 0.5)
+        for turns in (0, 1, -3):
+            found = imaging.from_texture(ltl.Mesh(corners, faces, uv=uv + turns), image)
+            np.testing.assert_allclose(found, exact, atol=1e-3)

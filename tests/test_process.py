@@ -7,10 +7,11 @@ import pytest
 import trimesh
 
 import ltljax as ltl
-from ltljax import imaging
+from ltljax import imaging, process
 from ltljax.cli import main
-from ltljax.mesh.columns import read_columns
-from ltljax.output import files, pictures
+from ltljax.mesh.columns import read_colors, read_columns
+from ltljax.output import files, pictures, texture
+from ltljax.process import images, results, subject
 
 COLORS = np.array([[0.9, 0.6, 0.2], [0.2, 0.4, 0.8]])
 NOISE = 0.1
@@ -231,11 +232,12 @@ def test_curvature_and_distance_of_a_sphere_are_written_in_the_order_of_the_file
 
 
 @pytest.mark.parametrize("field", ["smallest", "cross", pytest.param("rotation", marks=pytest.mark.slow)])
-def test_lines_of_a_field_are_drawn(tmp_path, ball, field):
+def test_lines_of_a_field_are_drawn(tmp_path, sphere, field):
     if not pictures.can_draw():
         pytest.skip("pictures are not installed")
-    out = tmp_path / field
-    call("lic", ball, "--field", field, "--resolution", "64", "--out", out)
+    out, egg = tmp_path / field, tmp_path / "egg.obj"
+    files.write_obj(egg, sphere.vertices * [1, 1.5, 0.8], sphere.faces)
+    call("lic", egg, "--field", field, "--resolution", "64", "--out", out)
     assert {path.name for path in out.iterdir()} == {"lic.json", "lic.ply", "lic.vtp", "lic.png"}
     image = pytest.importorskip("imageio.v3").imread(out / "lic.png")
     assert image.shape == (64, 128)
@@ -253,6 +255,114 @@ def test_no_file_of_the_user_is_replaced(tmp_path, ball, capsys, undrawn):
     code, said = fails(capsys, "smooth", same, "--out", tmp_path)
     assert code == 2
     assert "which the run reads" in said
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "obj", "ply"])
+def test_noisy_colours_above_one_are_not_taken_for_bytes(tmp_path, kind):
+    noisy = np.random.default_rng(0).uniform(-0.1, 1.1, size=(50, 3))
+    assert noisy.max() > 1
+    assert noisy.min() < 0
+    names = ("red", "green", "blue")
+    bytes_ = np.round(255 * noisy.clip(0, 1)).astype(np.uint8)
+    for values, expected in ((noisy, noisy), (bytes_, bytes_ / 255)):
+        path = tmp_path / f"colors.{kind}"
+        if kind == "csv":
+            path.write_text("\n".join([",".join(names), *(",".join(map(str, row)) for row in values.tolist())]))
+        elif kind == "npz":
+            np.savez(path, **dict(zip(names, values.T, strict=True)))
+        elif kind == "obj":
+            path.write_text("\n".join("v 0 0 0 {} {} {}".format(*row) for row in values.tolist()))
+        else:
+            number = "uchar" if values is bytes_ else "double"
+            head = ["ply", "format ascii 1.0", f"element vertex {len(values)}"]
+            head += [*(f"property {number} {name}" for name in names), "end_header"]
+            path.write_text("\n".join([*head, *(" ".join(map(str, row)) for row in values.tolist()), ""]))
+        found = images._column(path, None)[0] if kind in ("csv", "npz") else read_colors(path)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_vectors_by_name_keep_their_units(tmp_path):
+    velocity = np.random.default_rng(0).normal(size=(50, 3))
+    shades = np.random.default_rng(0).integers(0, 255, (50, 3))
+    np.savez(tmp_path / "data.npz", velocity=10 * velocity, whole=np.round(1000 * velocity), shades=shades)
+    for name, expected in dict(velocity=10 * velocity, whole=np.round(1000 * velocity), shades=shades / 255).items():
+        np.testing.assert_array_equal(images._column(tmp_path / "data.npz", name)[0], expected)
+
+
+def test_a_later_run_replaces_only_what_earlier_runs_have_written(tmp_path, ball, sphere, undrawn, capsys):
+    out, plain = tmp_path / "out", tmp_path / "plain.obj"
+    files.write_obj(plain, sphere.vertices, sphere.faces)
+    fair = ("--method", "fair", "--out", out)
+    call("smooth", ball, *fair)
+    (out / "smooth.obj").write_text("mine")
+    code, said = fails(capsys, "smooth", plain, *fair)
+    assert code == 2
+    assert "smooth.obj, which no such command has written" in said
+    assert (out / "smooth.obj").read_text() == "mine"
+    (out / "smooth.obj").unlink()
+    call("smooth", plain, *fair)
+    record = json.loads((out / "smooth.json").read_text())
+    assert record["files"] == ["smooth.vtp", "smooth.obj"]
+    assert record["earlier_files"] == ["smooth.ply"]
+    call("smooth", ball, *fair)
+
+
+def test_files_are_named_in_the_marker_before_they_are_written(tmp_path, monkeypatch):
+    mesh, out = mapped(4), tmp_path / "out"
+    path = tmp_path / "plane.obj"
+    files.write_obj(path, mesh.vertices, mesh.faces, mesh.uv)
+    monkeypatch.setattr(pictures, "can_draw", lambda: True)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(texture, "write_textured_obj", stop)
+    written = results.Results("denoise", subject.load(str(path), False), out, ())
+    with pytest.raises(KeyboardInterrupt):
+        written.textured(np.zeros((4, 4, 3), np.uint8))
+    names = [f"textured/denoise.{ending}" for ending in ("obj", "mtl", "png")]
+    assert json.loads((out / "denoise.json").read_text())["files"] == names
+    (out / "textured" / "denoise.png").write_text("half a picture")
+    results.Results("denoise", written.subject, out, ())
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "says"),
+    [
+        (process.denoise, dict(method="typo"), "method one of tv, heat, perona-malik, found 'typo'"),
+        (process.denoise, dict(noise=-1.0), "noise to be positive"),
+        (process.denoise, dict(noise=1.0, strength=1.0), "noise or strength, not both"),
+        (process.smooth, dict(method="typo"), "method one of flow, fair, features, found 'typo'"),
+        (process.smooth, dict(time=0.0), "time to be positive and finite, found 0"),
+        (process.smooth, dict(steps=0), "steps to be positive and finite, found 0"),
+        (process.smooth, dict(method="fair", strength=0.0), "strength to be positive"),
+        (process.lic, dict(field="typo"), "field one of smallest, largest, cross, rotation, found 'typo'"),
+    ],
+)
+def test_options_from_python_are_checked_as_those_of_the_command_line(tmp_path, command, options, says):
+    with pytest.raises(ValueError, match=says):
+        command("sphere", tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("field", ["smallest", "largest"])
+def test_a_sphere_has_no_directions_of_curvature(tmp_path, sphere, field, capsys):
+    # Rounded as other programs write it.
+    path, out = tmp_path / "round.obj", tmp_path / "out"
+    files.write_obj(path, np.round(sphere.vertices, 6), sphere.faces)
+    code, said = fails(capsys, "lic", path, "--field", field, "--out", out)
+    assert code == 2
+    assert f"no direction of {field} curvature: the surface bends alike in all directions everywhere" in said
+    assert "--field cross" in said
+    assert not out.exists()
+
+
+def test_colours_of_an_obj_are_kept_by_smoothing(tmp_path, sphere, noisy, undrawn):
+    path, out = tmp_path / "painted.obj", tmp_path / "out"
+    files.write_obj(path, sphere.vertices, sphere.faces, colors=noisy[1])
+    call("smooth", path, "--method", "fair", "--out", out)
+    np.testing.assert_allclose(read_colors(out / "smooth.obj"), noisy[1], atol=1e-8)
+    np.testing.assert_array_equal(ltl.load_mesh(out / "smooth.obj").faces, sphere.faces)
 
 
 def test_mistakes_are_one_line_and_leave_nothing_behind(tmp_path, ball, sphere, capsys, undrawn):

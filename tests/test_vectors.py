@@ -373,6 +373,8 @@ def test_vectors_that_react_settle_at_length_one(tori):
         for solver, how in ((None, {}), (ltl.TRBDF2(), {}), (ltl.SBDF2(), {"dt": 0.02}))
     ]
     assert rms(ends[0]) > 0.95
+    leaning = ltl.solve(equation, surface, start + surface.normals, t1=8.0).u_end
+    np.testing.assert_allclose(leaning, ends[0], atol=1e-9)  # what stands on the surface has no part
     assert float(jnp.abs(jnp.sum(ends[0] * surface.normals, axis=1)).max()) < 1e-12
     for other in ends[1:]:
         assert rms(other - ends[0]) < 0.02
@@ -416,7 +418,10 @@ def test_single_precision_is_as_accurate_as_it_can_be(jittered):
     found = ltl.vector_laplacian(single, jnp.asarray(X, jnp.float32))
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, ltl.vector_laplacian(jittered, X), atol=2e-3)
-    assert ltl.transport_vectors(single, 0, single.geometry.frames[0, 0]).dtype == jnp.float32
+    assert (
+        ltl.transport_vectors(single, [0, 5], np.asarray(single.geometry.frames[:6:5, 0], np.float64)).dtype
+        == jnp.float32
+    )
     assert ltl.helmholtz_hodge(single, jnp.asarray(X, jnp.float32)).gradient.dtype == jnp.float32
 
 
@@ -448,5 +453,38 @@ def test_mistakes_are_told_at_once(jittered):
     with pytest.raises(ValueError, match="returns the shape it is given"):
         ltl.VectorDiffusion(1.0, lambda X, params: X[:2]).rate(jnp.zeros(()), jittered, good)
     cylinder = ltl.Surface.from_mesh(ltl.shapes.cylinder(n_around=12, n_along=4))
-    with pytest.raises(ValueError, match="closed surface or disks, found 2 boundary loops"):
+    with pytest.raises(ValueError, match="closed surfaces or disks, found 2 boundary loops and 0 handles"):
         ltl.helmholtz_hodge(cylinder, jnp.ones((cylinder.num_vertices, 3)))
+    with pytest.raises(ValueError, match="path of vertices from 0 to 641, found 99999"):
+        ltl.transport_along(jittered, np.array([0, 99999]), good[0])
+    with pytest.raises(ValueError, match="positive time, found 0"):
+        ltl.transport_vectors(jittered, 3, good[3], time=0.0)
+    with pytest.raises(ValueError, match="zero on all of the surface"):
+        ltl.direction_field(jittered, 2, guide=jnp.zeros_like(good), time=0.1)
+
+
+def test_components_are_seen_to_one_by_one():
+    ball, tube = ltl.shapes.icosphere(2), ltl.shapes.cylinder(n_around=12, n_along=4)
+
+    def beside(a, b):
+        return ltl.Surface.from_mesh(
+            ltl.Mesh(
+                np.concatenate([a.vertices, b.vertices + np.array([5.0, 0.0, 0.0])]),
+                np.concatenate([a.faces, b.faces + a.num_vertices]),
+            )
+        )
+
+    two = beside(ball, ball)
+    index = np.asarray(ltl.singularities(two, ltl.direction_field(two, 4), 4)).reshape(2, -1)
+    np.testing.assert_array_equal((np.abs(index) > 0.1).sum(axis=1), 8)
+    with pytest.raises(ValueError, match="2 boundary loops and 0 handles on component 1"):
+        ltl.harmonic_fields(beside(ball, tube))
+
+
+def test_what_the_host_finds_can_be_asked_for_inside_jit(jittered, tori):
+    vector = jittered.geometry.frames[3, 0]
+    found = jax.jit(lambda v: ltl.transport_vectors(jittered, 3, v))(vector)
+    np.testing.assert_allclose(found, ltl.transport_vectors(jittered, 3, vector), atol=1e-12)
+    X = killing(tori[0])
+    parts = jax.jit(lambda X: ltl.helmholtz_hodge(tori[0], X))(X)
+    np.testing.assert_allclose(parts.harmonic, ltl.helmholtz_hodge(tori[0], X).harmonic, atol=1e-9)

@@ -18,15 +18,15 @@ Reaction = Callable[..., AnyArray]
 
 
 class VectorDiffusion(Equation):
-    """X_t = D Delta X + f(X) for a tangent field X, the state (V, 3), or for S fields at once, (V, S, 3).
+    """X_t = D Delta X + f(X) for a tangent field X, the state (V, 3).
 
-    Delta is `vector_laplacian`; of the state the tangent part counts, and what X_t adds is tangent. Without a reaction
-    no vector becomes longer than the longest at the start (with `Monotone`).
+    Delta is `vector_laplacian`; a normal part of the start is left out. Without a reaction no vector becomes longer
+    than the longest at the start (with `Monotone`).
 
     Attributes:
-        diffusivity: D, a positive number; for several fields also one for each, (S,).
-        reaction: f, a plain function ``(X, params) -> rate`` of the vectors at one point, (3,) or (S, 3); of the rate
-            the tangent part counts. None for none.
+        diffusivity: D, a positive number.
+        reaction: f, a plain function ``(X, params) -> rate`` of the vector at one point, (3,); of the rate the tangent
+            part counts. None for none.
         params: the parameters of the reaction, a pytree.
         symmetry: n where the state is the n-th power, in the frames, of a field that looks the same after a turn by
             1/n: see `connection`.
@@ -34,7 +34,7 @@ class VectorDiffusion(Equation):
     Source: Chen, Chi and Wu, arXiv 0907.1817, who announce vector-valued data; the operator as of `vector_laplacian`.
     """
 
-    diffusivity: Float[Array, "*S"] | float = 1.0
+    diffusivity: Float[Array, ""] | float = 1.0
     reaction: Reaction | None = None
     params: Any = None
     symmetry: int = eqx.field(static=True, default=1)
@@ -55,7 +55,7 @@ class VectorDiffusion(Equation):
         del t
         if self.reaction is None:
             return jnp.zeros_like(u)
-        reaction = self.reaction
+        reaction, u = self.reaction, tangential(surface, u)
         rate = jnp.asarray(jax.vmap(lambda X: reaction(X, self.params))(u), u.dtype)
         if rate.shape != u.shape:
             raise ValueError(
@@ -64,14 +64,18 @@ class VectorDiffusion(Equation):
         return tangential(surface, rate)
 
     def diffusivities(self, u):
-        """D for every component of every field."""
-        numbers = jnp.asarray(self.diffusivity, u.dtype)
-        return jnp.broadcast_to(numbers.reshape(*numbers.shape, 1), u.shape[1:])
+        """D for every component."""
+        return jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
 
     @property
     def is_affine(self) -> bool:
         """Whether there is no reaction."""
         return self.reaction is None
+
+    def held(self, t, surface: Surface, u):
+        """The tangent part of the state."""
+        del t
+        return tangential(surface, u)
 
     def spectral_bound(self, t, surface: Surface, u):
         """The largest diffusivity times the Laplacian's bound, which is the vector Laplacian's too, and the largest row
@@ -79,10 +83,7 @@ class VectorDiffusion(Equation):
         bound = jnp.max(jnp.abs(self.diffusivities(u))) * spectral_bound(surface)
         if self.reaction is None:
             return bound
-        flat = u.reshape(len(u), -1)
-        directions = jnp.eye(flat.shape[1], dtype=u.dtype)
         rate = lambda u: self.explicit_rate(t, surface, u)  # noqa: E731
-        columns = [
-            jax.jvp(rate, (u,), (jnp.broadcast_to(unit[None], flat.shape).reshape(u.shape),))[1] for unit in directions
-        ]
+        axes = jnp.eye(3, dtype=u.dtype)
+        columns = [jax.jvp(rate, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in axes]
         return bound + jnp.max(sum(jnp.abs(column) for column in columns))

@@ -116,10 +116,12 @@ def diffusion_tensor(
     x, y = (planar[:, 0, 0] - planar[:, 1, 1]) / 2, planar[:, 0, 1]
     root = jnp.sqrt(x**2 + y**2 + tiny**2)
     if enhancing == "edges":
-        across, along = 1 - jnp.exp(-_STEEPNESS / jnp.maximum((half + root) / squared, tiny) ** 4), 1.0
-        across = jnp.maximum(across, _LEAST)
+        # At a tenth the exponential is zero, in any float; below, its derivative would be zero times infinity.
+        ratio = jnp.maximum((half + root) / squared, 0.1)
+        across, along = jnp.maximum(1 - jnp.exp(-_STEEPNESS / ratio**4), _LEAST), 1.0
     else:
-        across, along = _LEAST, _LEAST + (1 - _LEAST) * jnp.exp(-((squared / (2 * root)) ** 2))
+        ratio = jnp.minimum(squared / (2 * root), 100)
+        across, along = _LEAST, _LEAST + (1 - _LEAST) * jnp.exp(-(ratio**2))
     # The unit tensor of the plane, and that of the two directions, the first with the sign of plus.
     plane = jnp.einsum("vai,vaj->vij", frames, frames)
     reflection = jnp.stack([jnp.stack([x, y], axis=1), jnp.stack([y, -x], axis=1)], axis=1) / root[:, None, None]
@@ -240,7 +242,14 @@ def _in_rounds(
         raise ValueError(f"Expected at least one round, found {rounds}.")
     u, share = signal(surface, u), number(surface, "time", time, may_be_zero=True) / rounds
     for _ in range(rounds):
-        u = anisotropic_diffusion(surface, u, tensor(u), share, **options)
+        found = tensor(u)
+        if isinstance(found, Tracer):
+            raise ValueError(
+                "The neighbours are chosen on the host, anew in every round, but the surface, the image or a number is "
+                "being traced by a JAX transformation. Call this function outside; or compute a tensor outside, with "
+                "ltl.imaging.diffusion_tensor, for ltl.imaging.anisotropic_diffusion, whose image may be traced."
+            )
+        u = anisotropic_diffusion(surface, u, found, share, **options)
     return u
 
 

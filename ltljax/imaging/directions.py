@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..surface import Surface
 from ..tables import AnyArray
 from .signals import check, number, signal
-from .smoothing import mean_over_windows
+from .smoothing import mean_after
 from .variation import denoise
 
 # How far from one a length may be to be that of a unit vector.
@@ -106,11 +106,8 @@ def _parts(colours: Array) -> tuple[Array, Array]:
 
 @eqx.filter_jit
 def _diffused(surface: Surface, d: Array, time: Array, steps: int) -> tuple[Array, Array]:
-    # A step of this time averages over a window of this radius.
-    scale = jnp.sqrt(2 * time / steps)
-
     def step(d, _):
-        mean, found = mean_over_windows(surface, d, scale)
+        mean, found = mean_after(surface, d, time / steps)
         squared = jnp.sum(mean**2, axis=1, keepdims=True)
         # Opposite directions may cancel; what has no direction keeps the one it had.
         has_none = squared <= jnp.finfo(d.dtype).eps ** 2

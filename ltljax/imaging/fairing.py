@@ -52,7 +52,8 @@ def mean_curvature_flow(
             shrinks area and needs no centre; a scaling would move most what is far from one.
         preconditioner: what `multigrid` returned for this surface or a similar one, for long steps on fine meshes;
             by default Jacobi's method.
-        throw: whether to raise when a step could not be solved. Inside jit nothing can be raised.
+        throw: whether to raise when a step could not be solved. Without it, and inside jit, where nothing can be
+            raised, all vertices are NaN then.
 
     Raises:
         ValueError: t1 or steps is not positive, or volume is to be kept of a surface with a boundary.
@@ -99,7 +100,8 @@ def fair(
         keep_volume: whether each component is given back the volume it had: see `mean_curvature_flow`.
         preconditioner: what `multigrid` returned for this surface or a similar one; by default Jacobi's method, and of
             order 2 multigrid where the extra `amg` is at hand and the surface is not being traced.
-        throw: whether to raise when the system could not be solved. Inside jit nothing can be raised.
+        throw: whether to raise when the system could not be solved. Without it, and inside jit, where nothing can be
+            raised, all vertices are NaN then.
 
     Raises:
         ValueError: the strength is not positive, the order is neither 1 nor 2, or volume is to be kept of a surface
@@ -150,7 +152,7 @@ def _flow(
         return (vertices, found & found_whole & found_half & found_again), None
 
     (vertices, found), _ = jax.lax.scan(step, (start, jnp.ones((), bool)), length=steps)
-    return vertices, found
+    return jnp.where(found, vertices, jnp.nan), found
 
 
 @eqx.filter_jit
@@ -159,7 +161,8 @@ def _faired(
 ) -> tuple[Array, Array]:
     start = surface.vertices
     vertices, found = _smoothed(surface, start, strength, order, multigrid)
-    return (with_volumes(surface, vertices, volumes(surface, start)) if keep_volume else vertices), found
+    vertices = with_volumes(surface, vertices, volumes(surface, start)) if keep_volume else vertices
+    return jnp.where(found, vertices, jnp.nan), found
 
 
 def _smoothed(
@@ -173,14 +176,15 @@ def _smoothed(
         return -strength * once if order == 1 else strength * laplacian(surface, jnp.where(is_held, 0, once))
 
     # For the change, to which the tolerance then refers, and which does not know where the origin is.
+    right = -jnp.where(is_held, 0, fall(vertices))
     found = linear_solve(
         lambda change: change + jnp.where(is_held, 0, fall(jnp.where(is_held, 0, change))),
-        -jnp.where(is_held, 0, fall(vertices)),
+        right,
         _inverse(surface, strength, order, multigrid),
         1e-10 if vertices.dtype == jnp.float64 else 1e-5,
         _MOST_ITERATIONS,
     )
-    return vertices + found.value, found.result == lx.RESULTS.successful
+    return vertices + found.value, (found.result == lx.RESULTS.successful) & jnp.all(jnp.isfinite(right))
 
 
 def _along(normals: Array, change: Array) -> Array:

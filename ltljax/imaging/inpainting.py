@@ -101,7 +101,8 @@ def _biharmonic(surface: Surface, u: Array, mask: Array, inverse: Factorized | N
     share = _EXACT[jnp.dtype(u.dtype)]
 
     def solve(apply, b):
-        return conjugate_gradients(apply, b, about_inverse, share, _MAX_ITERATIONS)
+        x, missed = conjugate_gradients(apply, b, about_inverse, share, _MAX_ITERATIONS)
+        return jnp.where(missed <= 100**2, x, jnp.nan)
 
     found = jax.lax.custom_linear_solve(apply, right, solve, symmetric=True)
     # In the norm that the iteration knows the size of.

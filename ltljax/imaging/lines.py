@@ -18,14 +18,14 @@ from ..surface import Surface
 from ..tables import AnyArray
 from ..tables.table import take
 from .noise import SolidNoise, solid_noise
-from .tracing import Points, checked_points, mean_edge, positions, tangent_field
+from .tracing import Points, checked_points, mean_edge, most_crossings, positions, tangent_field
 from .views import View, look
 from .walking import Faces, Walkers, faces_along, start, walk
 
 # Of the lines, in grains of the noise, to either side.
 _LENGTH = 24
-# Crossings a line may have beside its steps: to get away from a vertex, and for each half edge length.
-_AROUND, _PER_STEP = 8, 1.5
+# Edges a line may cross beside those of its length: to get away from a vertex.
+_AROUND = 8
 # Lines at once: what belongs to so many stays in the cache.
 _BATCH = 1 << 13
 # Of the grey values of a picture, in standard deviations from black to white.
@@ -51,11 +51,15 @@ def line_integral_convolution(
     Nearly the same on one line and unlike on its neighbours, so that a picture of it shows the lines. Linear in the
     noise, and differentiable in it in both modes.
 
+    So that every loop ends, a line crosses at most 2.5 edges for each short edge in its length (shorter are 5 % of the
+    edges; where the surface is traced, an edge as long as the step). Where it would cross more, as in a part of a mesh
+    much finer than that, or to and fro around a vertex, it ends early, and its mean is that of the part walked.
+
     Args:
         surface: the surface.
         X: (V, 3), tangent; its length does not count.
         length: of the line to either side; by default 48 steps. At its end the window vanishes; at a
-            boundary or a zero of the field the line ends before.
+            boundary or a zero of the field the line ends before, as where it crosses too many edges.
         noise: (V,), interpolated between vertices, or a `SolidNoise`; by default uniform between 0 and 1 on the
             vertices, or at points a solid noise whose grain is a step.
         key: of the random numbers of the default noise; by default of seed 0.
@@ -91,7 +95,7 @@ def line_integral_convolution(
         noise = jnp.asarray(noise, surface.dtype)
         if noise.shape != (surface.num_vertices,):
             raise ValueError(f"Expected a noise of shape ({surface.num_vertices},), found {noise.shape}.")
-    stretches = int(np.ceil(length / step) + np.ceil(_PER_STEP * length / step)) + _AROUND
+    stretches = int(np.ceil(length / step)) + most_crossings(surface, length, step) + _AROUND
     faces, (most, each) = faces_along(surface, X), jnp.asarray([length, step], surface.dtype)
     return convolved(surface, faces, face, weights, noise, most, each, stretches, window, is_directed)
 
@@ -158,7 +162,8 @@ def lic_picture(
         view: from where to look, as a direction; without perspective.
         up: what points upwards in the picture.
         resolution: pixels of its height and width.
-        length: of the lines to either side; by default 24 grains of the noise, which are two pixels each.
+        length: of the lines to either side; by default 24 grains of the noise, which are two pixels each. Lines may
+            end before as those of `line_integral_convolution`.
         key: of the random numbers; by default of seed 0.
         shading: how much the light counts, from 0 to 1.
         is_directed: false where X and -X mean the same, as principal directions of curvature do.
@@ -167,21 +172,28 @@ def lic_picture(
         The picture (H, W) of unsigned bytes, white where the surface is not, and where it is (H, W) bool.
 
     Raises:
-        ValueError: X does not fit or is not tangent, or the view is along ``up``.
+        ValueError: X does not fit or is not tangent, the length is not positive, the view is along ``up``, or the
+            surface is being traced.
 
     Source: Cabral and Leedom (1993), doi:10.1145/166117.166151.
     """
     X = tangent_field(surface, X)
     if not 0 <= shading <= 1:
         raise ValueError(f"Expected a shading from 0 to 1, found {shading}.")
-    edge = mean_edge(surface)
+    if length is not None and not length > 0:
+        raise ValueError(f"Expected a positive length of the lines, found {length}.")
+    if surface.is_traced:
+        raise ValueError(
+            "A picture is drawn on the host, but the surface is being traced by a JAX transformation. Call this "
+            "function outside."
+        )
     seen = look(np.asarray(surface.vertices, np.float64), np.asarray(surface.faces), view, up, resolution)
     grain = 2 * seen.pixel
     length = _LENGTH * grain if length is None else length
     key = jax.random.key(0) if key is None else key
     noise = solid_noise(key, grain, surface.dtype)
     faces = faces_along(surface, X)
-    stretches = int(np.ceil(length / grain) + np.ceil(2 * _PER_STEP * length / edge)) + _AROUND
+    stretches = int(np.ceil(length / grain)) + most_crossings(surface, length, grain) + _AROUND
     most, each = jnp.asarray([length, grain], surface.dtype)
 
     def lines(face: np.ndarray, weights: np.ndarray) -> Array:

@@ -145,7 +145,8 @@ def minimise(
 ) -> tuple[Float[Array, "V C"], Bool[Array, ""], Int[Array, ""]]:
     """The minimiser, whether it was found, and the number of steps; differentiable in the functional.
 
-    Ends when a full step changes the root mean square of u over the vertices by at most ``tolerance``.
+    Ends when a full step changes the root mean square of u over the vertices by at most ``tolerance``. Derivatives are
+    NaN where their linear system was not solved.
     """
     fixed, start = jax.lax.stop_gradient((functional, start))
     u, found, steps = _newton(fixed, start, jnp.asarray(tolerance, start.dtype), max_steps)
@@ -153,10 +154,12 @@ def minimise(
     _, diagonal = fixed.curvature(g, g)
     share = _EXACT[jnp.dtype(u.dtype)]
 
+    def exactly(apply, b):
+        x, missed = conjugate_gradients(apply, b, lambda r: r / diagonal, share, _MAX_ITERATIONS)
+        return jnp.where(missed <= 1, x, jnp.nan)
+
     def tangent_solve(apply, b):
-        return jax.lax.custom_linear_solve(
-            apply, b, lambda apply, b: conjugate_gradients(apply, b, lambda r: r / diagonal, share), symmetric=True
-        )
+        return jax.lax.custom_linear_solve(apply, b, exactly, symmetric=True)
 
     # Newton's method has found the root; what is left for this is its derivative.
     root = jax.lax.custom_root(lambda u: functional.slope(u), u, lambda _, u: u, tangent_solve)
@@ -169,8 +172,9 @@ def conjugate_gradients(
     inverse: Callable[[Array], Array],
     share: Any,
     max_steps: int = _MAX_ITERATIONS,
-) -> Array:
-    """The x with ``apply(x) = b`` for a symmetric positive operator, up to a share of b in the norm of the inverse.
+) -> tuple[Array, Array]:
+    """The x with ``apply(x) = b`` for a symmetric positive operator, up to a share of b in the norm of the inverse; and
+    the square of what is left over that share, at most one where x was found.
 
     Args:
         apply: the operator.
@@ -197,8 +201,8 @@ def conjugate_gradients(
     z = inverse(b)
     rho = jnp.sum(b * z)
     goal = jnp.maximum(jnp.asarray(share, b.dtype) ** 2 * rho, tiny)
-    x, *_ = jax.lax.while_loop(goes_on, step, (jnp.zeros_like(b), b, z, rho, jnp.zeros((), jnp.int32)))
-    return x
+    x, _, _, rho, _ = jax.lax.while_loop(goes_on, step, (jnp.zeros_like(b), b, z, rho, jnp.zeros((), jnp.int32)))
+    return x, rho / goal
 
 
 def _newton(functional: Functional, start: Array, tolerance: Array, max_steps: int) -> tuple[Array, Array, Array]:
@@ -213,7 +217,7 @@ def _newton(functional: Functional, start: Array, tolerance: Array, max_steps: i
         u, p, _, steps = carry
         g = faces.gradient(u)
         apply, diagonal = functional.curvature(g, p)
-        du = conjugate_gradients(apply, -functional.slope(u), lambda r: r / diagonal, _FORCING)
+        du, _ = conjugate_gradients(apply, -functional.slope(u), lambda r: r / diagonal, _FORCING)
         lengths = functional.lengths(g)[None, :, None]
         dg = faces.gradient(du)
         p = (g + dg - p * jnp.sum(g * dg, axis=(0, 2))[None, :, None] / lengths) / lengths

@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from ..operators import curvature, gradient, hessian
 from ..surface import Surface
+from ..tables import AnyArray
+from .signals import number
 
 
 class Ridges(eqx.Module):
@@ -24,8 +26,7 @@ class Ridges(eqx.Module):
     valley: Float[Array, " V"]
 
 
-@eqx.filter_jit
-def ridges(surface: Surface, width: float = 1.0) -> Ridges:
+def ridges(surface: Surface, width: float | AnyArray = 1.0) -> Ridges:
     """Ridges and valleys as fields from 0 to 1.
 
     A vertex is on a ridge where the larger principal curvature k, positive and larger than the other in magnitude, is
@@ -39,11 +40,16 @@ def ridges(surface: Surface, width: float = 1.0) -> Ridges:
         width: of the lines, in mean edge lengths.
 
     Raises:
-        ValueError: `Paper` has no second derivatives of its own.
+        ValueError: the width is not positive, or `Paper` has no second derivatives of its own.
 
     Source: Ohtake, Belyaev and Seidel (2004), Ridge-valley lines on meshes via implicit surface fitting,
     doi:10.1145/1015706.1015768.
     """
+    return _ridges(surface, number(surface, "width", width))
+
+
+@eqx.filter_jit
+def _ridges(surface: Surface, width: Array) -> Ridges:
     bent = curvature(surface)
     size = jnp.sqrt(jnp.mean(bent.principal**2))
     tiny = jnp.finfo(surface.dtype).tiny

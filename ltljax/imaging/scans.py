@@ -30,14 +30,15 @@ def denoise_mesh(
     First the normals of faces: each becomes a mean over the faces that share a vertex with it, with the weights
     ``area * exp(-|c - c'|^2 / 2 d^2) * exp(-|n - n'|^2 / 2 similarity^2)`` of centroids c, the root mean
     square d of their distances, and normals n, again and again. Then the vertices: each moves along the normals of its
-    faces towards their planes, again and again. The volume is nearly kept, since nothing shrinks.
-    Differentiable in the vertices.
+    faces towards their planes, again and again. Where edges stay the volume changes little: of a noisy cube by less
+    than a thousandth. Differentiable in the vertices.
 
     Args:
         surface: the surface.
         similarity: how far apart unit normals may be and still count as the same: well below what they differ by
             across an edge that is to stay, and about what noise makes of neighbours. With noise of a fifth of an edge
-            length the edges of a cube stay with 0.3 and 0.4, and go with 0.5.
+            length, and 20 iterations of the filter, the edges of a cube stay with 0.3 and 0.4, lose their sharpness
+            with 0.5, and are gone with 0.7.
         normal_iterations: of the filter. Few spare the small parts of a scan; shapes made of planes come out better
             with 20.
         vertex_iterations: of the vertices.

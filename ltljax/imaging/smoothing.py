@@ -52,7 +52,16 @@ def mean_over_windows(
     surface: Surface, u: Float[Array, "V *C"], scale: Float[Array, ""]
 ) -> tuple[Float[Array, "V *C"], Bool[Array, ""]]:
     """What `smoothed` returns, and whether it was found."""
-    half = jnp.asarray(scale, u.dtype) ** 2 / 2
+    return mean_after(surface, u, jnp.asarray(scale, u.dtype) ** 2 / 2)
+
+
+@eqx.filter_jit
+def mean_after(
+    surface: Surface, u: Float[Array, "V *C"], time: Float[Array, ""]
+) -> tuple[Float[Array, "V *C"], Bool[Array, ""]]:
+    """The image after one implicit step of diffusion over a time, half the square of a window's radius, and whether
+    it was found."""
+    half = jnp.asarray(time, u.dtype)
     inverse = Jacobi(1 / (1 - half * diagonal(surface)[:, None]))
     share = _EXACT[jnp.dtype(u.dtype)]
     # For what is added to u, so that constants stay as they are, to the last digit.

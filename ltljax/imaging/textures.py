@@ -11,12 +11,16 @@ from jaxtyping import Bool, Float
 from ..mesh import Mesh
 from .views import _axes
 
+# As near to the rim of the image, in its size, a place counts as on it.
+_RIM = 1e-4
+
 
 def from_texture(mesh: Mesh, image: np.ndarray) -> Float[np.ndarray, "V *C"]:
     """The values of an image at the vertices, through the UV map (host).
 
     Bilinear between the centres of pixels at the place of every corner, then the mean over the corners of each vertex,
-    which differ where two charts meet. What the map places outside the image is repeated.
+    which differ where two charts meet. What the map places outside the image is repeated; within 1e-4 of the rim it
+    counts as on it, as what rounding has moved across would be read on the other side.
 
     Args:
         mesh: a mesh with a UV map, v upwards.
@@ -38,8 +42,10 @@ def from_texture(mesh: Mesh, image: np.ndarray) -> Float[np.ndarray, "V *C"]:
     if not np.isfinite(mesh.uv).all():
         face = int(np.argmin(np.isfinite(mesh.uv).all(axis=(1, 2))))
         raise ValueError(f"Expected a UV map of finite numbers, found others in face {face}. Unwrap the mesh anew.")
+    rim = np.round(mesh.uv)
+    uv = np.where(np.abs(mesh.uv - rim) <= _RIM, rim, mesh.uv)
     # What lies far outside is repeated, so whole turns may be left out.
-    places = (mesh.uv - np.floor(mesh.uv.min(axis=1, keepdims=True))).reshape(-1, 2)
+    places = (uv - np.floor(uv.min(axis=1, keepdims=True))).reshape(-1, 2)
     values = _bilinear(pixels, places)
     vertex, count = mesh.faces.ravel(), np.bincount(mesh.faces.ravel(), minlength=mesh.num_vertices)
     columns = values.reshape(len(values), -1).T

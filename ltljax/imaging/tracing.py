@@ -16,12 +16,15 @@ from jaxtyping import Array, Bool, Float, Int
 from ..surface import Surface
 from ..tables import AnyArray
 from ..tables.table import take
-from .walking import CORNERS, VANISHES, faces_along, start, walk
+from ..vectors import check_tangent
+from .walking import CORNERS, faces_along, start, walk
 
-# A vector with more than this share of its length along the normal is not tangent.
-_TANGENT = 1e-3
-# Faces crossed in one step; a walker that has crossed more is lost.
-_CROSSINGS = 32
+# Edges that a line may cross in one step beside those of its length: around a vertex, and where faces are small.
+_AROUND = 32
+# Edges crossed in the length of an edge: at most 2.31 where all faces are equilateral.
+_PER_EDGE = 2.5
+# The share of edges, in percent, that are shorter than what counts as a short one.
+_SHORT = 5
 
 Points = tuple[Int[AnyArray, " N"], Float[AnyArray, "N 3"]]
 
@@ -31,8 +34,8 @@ class Streamlines(eqx.Module):
 
     Attributes:
         points: (N, steps + 1, 3) the positions, the first the seed.
-        is_valid: (N, steps + 1) false from where a line has ended at a boundary or a zero of the field; its points stay
-            there.
+        is_valid: (N, steps + 1) false from where a line has ended at a boundary or a zero of the field, or has crossed
+            too many edges in one step; its points stay there.
     """
 
     points: Float[Array, "N T 3"]
@@ -52,6 +55,10 @@ def streamlines(
 
     Inside every face the midpoint rule; a line that leaves a face goes on in the next from the point where it crosses
     the edge. Against the field with -X. Differentiable in X, but for which edges are crossed.
+
+    So that every loop ends, a step crosses at most 32 edges and 2.5 for each short edge in its length (shorter are 5 %
+    of the edges; where the surface is traced, an edge as long as the step). A line that would cross more in one step,
+    as with a long step through the finest part of a graded mesh, ends there: shorter steps take it further.
 
     Args:
         surface: the surface.
@@ -78,11 +85,12 @@ def streamlines(
     if not length > 0 or not step > 0:
         raise ValueError(f"Expected a positive length and step, found {length} and {step}.")
     steps = int(np.ceil(float(length) / float(step) - 1e-9))
-    return _streamlines(surface, X, face, weights, jnp.asarray(length / steps, surface.dtype), steps, is_directed)
+    most, each = _AROUND + most_crossings(surface, length / steps, step), jnp.asarray(length / steps, surface.dtype)
+    return _streamlines(surface, X, face, weights, each, steps, most, is_directed)
 
 
 @eqx.filter_jit
-def _streamlines(surface, X, face, weights, step, steps, is_directed) -> Streamlines:
+def _streamlines(surface, X, face, weights, step, steps, most, is_directed) -> Streamlines:
     faces = faces_along(surface, X)
 
     def advance(walkers, _):
@@ -96,7 +104,7 @@ def _streamlines(surface, X, face, weights, step, steps, is_directed) -> Streaml
             return jax.lax.cond(jnp.any(walkers.walks & (room > 0)), further, lambda carry: carry, carry), None
 
         full = jnp.full(walkers.face.shape, step)
-        (walkers, room), _ = jax.lax.scan(stretch, (walkers, full), length=_CROSSINGS)
+        (walkers, room), _ = jax.lax.scan(stretch, (walkers, full), length=most)
         arrived = walkers.walks & (room <= 0)
         walkers = eqx.tree_at(lambda w: w.walks, walkers, arrived)
         return walkers, (positions(surface, walkers.face, walkers.weights), arrived)
@@ -124,23 +132,7 @@ def tangent_field(surface: Surface, X: AnyArray) -> Float[Array, "V 3"]:
             f"Expected a vector field with one row per vertex, ({surface.num_vertices}, 3), found shape {jnp.shape(X)}."
         )
     X = jnp.asarray(X, surface.dtype)
-    if isinstance(X, Tracer) or surface.is_traced:
-        return X
-    values, normals = np.asarray(X, np.float64), np.asarray(surface.normals, np.float64)
-    is_bad = ~np.isfinite(values).all(axis=1)
-    if is_bad.any():
-        first = int(np.argmax(is_bad))
-        raise ValueError(f"Expected a finite vector field, found {values[first]} at vertex {first}.")
-    outwards, size = np.abs(np.sum(values * normals, axis=1)), np.linalg.norm(values, axis=1)
-    # Of vectors that count as zero nothing is asked.
-    is_bad = outwards > _TANGENT * np.maximum(size, VANISHES * size.max(initial=0))
-    if is_bad.any():
-        first = int(np.argmax(is_bad))
-        raise ValueError(
-            f"Expected tangent vectors, but at vertex {first} (and {is_bad.sum() - 1} others) the normal part is "
-            f"{outwards[first] / size[first]:.2g} of the length. Project first: "
-            "X - (X * surface.normals).sum(1, keepdims=True) * surface.normals."
-        )
+    check_tangent(surface, X)
     return X
 
 
@@ -176,6 +168,16 @@ def checked_points(surface: Surface, seeds: AnyArray | Points) -> tuple[Int[Arra
     return face, weights
 
 
+def most_crossings(surface: Surface, length: float, step: float) -> int:
+    """How many edges a line of some length may cross (host).
+
+    As many as in a mesh of short edges; where the surface is traced these count as long as the step.
+    """
+    is_unknown = surface.is_traced or isinstance(surface.faces, Tracer)
+    short = step if is_unknown else np.percentile(_edges(surface), _SHORT)
+    return int(np.ceil(_PER_EDGE * float(length) / max(float(short), 1e-3 * float(step))))
+
+
 def mean_edge(surface: Surface) -> float:
     """The mean length of the edges, those inside counted twice (host)."""
     if surface.is_traced or isinstance(surface.faces, Tracer):
@@ -183,8 +185,12 @@ def mean_edge(surface: Surface) -> float:
             "Lengths are chosen on the host, but the surface is being traced by a JAX transformation. Give step= and "
             "length= as numbers."
         )
+    return float(_edges(surface).mean())
+
+
+def _edges(surface: Surface) -> np.ndarray:
     vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces)
-    return float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
+    return np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1)
 
 
 def _check_range(indices: Any, count: int, what: str, kind: str) -> None:

@@ -32,7 +32,9 @@ class DataError(ValueError):
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file by name, float64; of a PLY without the positions, of a VTP without the vectors.
+    """The arrays of a file by name; of a PLY without the positions, of a VTP without the vectors.
+
+    They have the types of the file; columns of a CSV are of integers where they hold nothing else.
 
     Raises:
         DataError: there is no such file, its ending is not known, or it is damaged or too large.
@@ -43,7 +45,7 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise DataError(path, f"a file, and there is none at {path}")
     try:
-        return {name: np.asarray(values, np.float64) for name, values in reader(path).items()}
+        return {name: _numbers(name, values) for name, values in reader(path).items()}
     except ImportError:
         raise DataError(path, 'a file that can be read without the extra "viz" (pip install "ltljax[viz]")') from None
     except Exception as error:
@@ -67,7 +69,7 @@ def read_colors(path: Path) -> np.ndarray | None:
     if not rows or any(len(words) < 7 for words in rows):
         return None
     try:
-        return _from_zero_to_one(np.array([[float(word) for word in words[4:7]] for words in rows]))
+        return from_zero_to_one(_integers(np.array([[float(word) for word in words[4:7]] for words in rows])))
     except ValueError:
         return None
 
@@ -76,12 +78,34 @@ def colors_of(columns: dict[str, np.ndarray]) -> np.ndarray | None:
     """The colours (V, 3), from 0 to 1, where red, green and blue are among the columns."""
     if not set(_CHANNELS) <= columns.keys():
         return None
-    return _from_zero_to_one(np.stack([columns[name] for name in _CHANNELS], axis=1))
+    return from_zero_to_one(np.stack([columns[name] for name in _CHANNELS], axis=1))
 
 
-def _from_zero_to_one(colors: np.ndarray) -> np.ndarray:
-    """Colours that may be bytes."""
-    return colors / 255 if colors.size and np.nanmax(colors) > 1 else colors
+def from_zero_to_one(colors: np.ndarray) -> np.ndarray:
+    """Colours as float64: unsigned integers over their largest, other integers over 255 if they can only be bytes.
+
+    Floating-point numbers stay as they are, those above 1 too: noise makes such.
+    """
+    kind, size = colors.dtype.kind, colors.dtype.itemsize
+    most = 1
+    if kind == "u" and size <= 2:
+        most = np.iinfo(colors.dtype).max
+    elif kind in "iu" and colors.size and colors.min() >= 0 and 1 < colors.max() <= 255:
+        most = 255
+    return colors.astype(np.float64) / most
+
+
+def _numbers(name: str, values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    if values.dtype.kind not in "biuf":
+        raise ValueError(f"expected numbers as {name}, found {values.dtype}")
+    return values
+
+
+def _integers(values: np.ndarray) -> np.ndarray:
+    """Numbers of a text, as integers if all are whole."""
+    # Beyond 2^53 not all of them are told apart.
+    return values.astype(np.int64) if np.all((values == np.floor(values)) & (np.abs(values) < 2**53)) else values
 
 
 def _npz(path: Path) -> dict[str, Any]:
@@ -100,7 +124,7 @@ def _csv(path: Path) -> dict[str, Any]:
     values = np.array([[float(entry) for entry in line.split(",")] for line in lines[1:] if line.strip()])
     if values.ndim != 2 or values.shape[1] != len(names):
         raise ValueError(f"expected rows of {len(names)} numbers below the names")
-    return dict(zip(names, values.T, strict=True))
+    return {name: _integers(column) for name, column in zip(names, values.T, strict=True)}
 
 
 def _ply(path: Path) -> dict[str, Any]:

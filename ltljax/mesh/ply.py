@@ -42,20 +42,20 @@ def parse_ply(data: bytes) -> Polygons:
 
 
 def vertex_properties(data: bytes) -> dict[str, np.ndarray]:
-    """What a PLY file has at its vertices, by name, coordinates included."""
+    """What a PLY file has at its vertices, by name and of the types it states, coordinates included."""
     kind, elements, body = _parts(data)
     if not elements or elements[0].name != "vertex" or any(item.size_code for item in elements[0].properties):
         raise MeshError("expected vertices first, without lists.")
     element = elements[0]
-    names = [item.name for item in element.properties]
     if kind == "ascii":
         lines = [words for line in body.decode("utf-8", errors="replace").splitlines() if (words := line.split())]
         values = np.array(next_rows(lines, 0, element.rows, element.name), dtype=np.float64)
-        return dict(zip(names, values.T, strict=True))
+        columns = zip(element.properties, values.T, strict=True)
+        return {item.name: column.astype(item.code) for item, column in columns}
     dtype = np.dtype([(item.name, _BYTE_ORDERS[kind] + item.code) for item in element.properties])
     _expect(body, 0, element.rows * dtype.itemsize, element)
     rows = np.frombuffer(body, dtype, element.rows)
-    return {name: rows[name].astype(np.float64) for name in names}
+    return {item.name: rows[item.name].astype(item.code) for item in element.properties}
 
 
 def _parts(data: bytes) -> tuple[str, list[_Element], bytes]:

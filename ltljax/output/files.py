@@ -20,7 +20,12 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
 
 
 def write_obj(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None, material: str | None = None
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | None = None,
+    material: str | None = None,
+    colors: np.ndarray | None = None,
 ) -> None:
     """Write an OBJ.
 
@@ -30,9 +35,11 @@ def write_obj(
         faces: (F, 3).
         uv: (F, 3, 2) places in an image of the corners of every face.
         material: the name of an MTL file beside it, whose material ``surface`` the faces have.
+        colors: (V, 3), from 0 to 1, which follow the positions; not all programs read them.
     """
     lines = [] if material is None else [f"mtllib {material}", "usemtl surface"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    rows = vertices if colors is None else np.concatenate([vertices, colors], axis=1)
+    lines += ["v " + " ".join(f"{number:.9g}" for number in row) for row in rows.tolist()]
     if uv is None:
         lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     else:

@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 # What a run writes beside its series, by ending.
 _ENDINGS = ("html", "pvd", "ply", "glb", "png", "mp4", "gif")
@@ -64,7 +65,7 @@ def check_results(out: Path, marker: str, results: Iterable[str], inputs: Iterab
 
     Args:
         out: the folder, which may be absent.
-        marker: the name of the JSON file by which the command knows what it has written.
+        marker: the name of the JSON file by which the command knows what it has written, as of `written_before`.
         results: the names of the other files that it may write.
         inputs: the files that are read.
 
@@ -73,10 +74,21 @@ def check_results(out: Path, marker: str, results: Iterable[str], inputs: Iterab
     """
     there = [path for path in (out / name for name in (marker, *results)) if path.exists()]
     _spare_inputs(out, there, inputs)
-    if there and not _has_keys(out / marker, {"command", "measured", "versions"}):
+    own = {out / name for name in written_before(out, marker)}
+    foreign = [path for path in there if path not in own]
+    if foreign:
         raise OutputError(
-            f"The results would replace {there[0]}, which no such command has written. Name another --out."
+            f"The results would replace {foreign[0]}, which no such command has written. Name another --out."
         )
+
+
+def written_before(out: Path, marker: str) -> list[str]:
+    """The files that a command has written to a folder, the marker first; none without a marker of its own."""
+    record = _record(out / marker)
+    if not {"command", "measured", "versions"} <= record.keys():
+        return []
+    lists = [record.get(key) for key in ("files", "earlier_files")]
+    return [marker, *(name for names in lists if isinstance(names, list) for name in names if isinstance(name, str))]
 
 
 def _spare_inputs(out: Path, results: Iterable[Path], inputs: Iterable[Path]) -> None:
@@ -115,8 +127,13 @@ def _is_of_a_run(out: Path) -> bool:
 
 def _has_keys(path: Path, keys: set[str]) -> bool:
     """Whether a file holds a JSON object with these keys."""
+    return keys <= _record(path).keys()
+
+
+def _record(path: Path) -> dict[str, Any]:
+    """The JSON object of a file; empty where it holds none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(found, dict) and keys <= found.keys()
+        return {}
+    return found if isinstance(found, dict) else {}

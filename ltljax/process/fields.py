@@ -19,13 +19,21 @@ from .subject import Subject
 FIELDS = ("smallest", "largest", "cross", "rotation")
 # For how long directions of curvature are smoothed, in squared edge lengths.
 _SMOOTHING = 1.0
+# Of the largest curvature, how far apart the two are that count as equal: files round positions to six digits.
+_EQUAL = 3e-3
 
 
 def line_fields(subject: Subject, name: str) -> list[Float[Array, "V 3"]]:
-    """The unit fields that a name stands for: one, or the two of the crosses.
+    """The fields that a name stands for: one, or the two of the crosses.
+
+    Directions are unit vectors; the rotation is about the vertical through the middle, longer the farther from it, and
+    zero on it.
 
     Directions of curvature are smoothed over an edge, each with the weight of the difference of the two curvatures:
     where both are equal there is no direction, and its surroundings decide.
+
+    Raises:
+        ValueError: a direction of curvature, and the two are equal everywhere, as on a sphere.
     """
     surface = subject.surface
     if name == "cross":
@@ -37,9 +45,25 @@ def line_fields(subject: Subject, name: str) -> list[Float[Array, "V 3"]]:
         axis = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], surface.dtype), surface.vertices.shape)
         return [tangential(surface, jnp.cross(axis, surface.vertices - middle[None]))]
     bent = curvature(surface)
-    apart = (bent.principal[:, 0] - bent.principal[:, 1])[:, None]
-    guide = tangential(surface, apart * bent.directions[:, 0 if name == "largest" else 1])
+    apart = bent.principal[:, 0] - bent.principal[:, 1]
+    _check_directions(surface, np.asarray(bent.principal), np.asarray(apart), name)
+    guide = tangential(surface, apart[:, None] * bent.directions[:, 0 if name == "largest" else 1])
     return [direction_field(surface, 2, guide, _SMOOTHING * subject.edge**2)]
+
+
+def _check_directions(surface: Surface, principal: np.ndarray, apart: np.ndarray, name: str) -> None:
+    components = np.asarray(surface.topology.components)
+    # That of a sphere of the same area counts where nothing bends.
+    scale = np.abs(principal).max() + np.sqrt(4 * np.pi / np.asarray(surface.vertex_areas).sum())
+    of_components = np.zeros(surface.topology.num_components)
+    np.maximum.at(of_components, components, apart)
+    if apart.max() > _EQUAL * scale and (of_components > 0).all():
+        return
+    where = "everywhere" if apart.max() <= _EQUAL * scale else f"on all of component {int(np.argmin(of_components))}"
+    raise ValueError(
+        f"There is no direction of {name} curvature: the surface bends alike in all directions {where}, as a sphere or "
+        "a plane does. Choose another field, such as --field cross."
+    )
 
 
 def combed(surface: Surface, X: np.ndarray) -> Float[Array, "V 3"]:

@@ -11,10 +11,10 @@ import numpy as np
 
 from .. import imaging
 from ..imaging.variation import deviation
-from ..mesh.columns import DataError, colors_of, read_colors, read_columns
+from ..mesh.columns import DataError, colors_of, from_zero_to_one, read_colors, read_columns
 from ..operators import gradient
 from .results import Results, usual
-from .subject import Subject, load
+from .subject import Subject, check_choice, check_positive, load
 
 METHODS = ("tv", "heat", "perona-malik")
 # Of the median slope, how much a slope may be and still count as noise.
@@ -54,9 +54,14 @@ def denoise(
         repair: mend a mesh file that is not acceptable.
 
     Raises:
-        ValueError: a file does not fit, there is nothing to denoise, or the noise explains all there is.
+        ValueError: a file or an option does not fit, there is nothing to denoise, or the noise explains all there is.
         SolveError: the image was not found.
     """
+    check_choice("method", method, METHODS)
+    check_positive(noise=noise, strength=strength)
+    for first, second, both in (("noise", "strength", (noise, strength)), ("image", "data", (image, data))):
+        if None not in both:
+            raise ValueError(f"Expected {first} or {second}, not both. Leave one of them away.")
     subject = load(mesh, repair)
     size, u, what = _values(subject, image, data, name)
     inputs = [path for path in (image, data) if path is not None]
@@ -165,8 +170,7 @@ def _column(path: Path, name: str | None) -> tuple[np.ndarray, str]:
         raise ValueError(f"{path.name}: expected one column, or red, green and blue; found {names}. Choose by --name.")
     if values.ndim != 1 and values.shape[1:] != (3,):
         raise DataError(path, f"{what} of shape (V,), or (V, 3) for colours, not {values.shape}")
-    if values.ndim == 2:
-        values = values / 255 if values.size and np.nanmax(values) > 1 else values
+    values = from_zero_to_one(values) if values.ndim == 2 else np.asarray(values, np.float64)
     if numbers is not None:
         if not np.array_equal(np.sort(numbers), np.arange(len(numbers))) or len(numbers) != len(values):
             raise DataError(path, "each vertex once in its column vertex, counted from 0")

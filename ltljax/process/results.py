@@ -21,7 +21,7 @@ _SHOWN, _SHOWN_ABOUT_ZERO = 98, 90
 
 
 class Results:
-    """The folder of a command, which is made and marked with the first file.
+    """The folder of a command, which is made with the first file; before each the marker names it as the command's.
 
     Args:
         command: its name, with which the names of all files begin.
@@ -40,6 +40,7 @@ class Results:
 
         self.command, self.subject, self.out = command, subject, out
         self.files: list[str] = []
+        self._before = folder.written_before(out, self.marker)[1:]
         self.draws = can_draw()
         names = [f"{command}.{ending}" for ending in ("ply", "vtp", "obj")]
         names += [f"textured/{command}.{ending}" for ending in ("obj", "mtl", "png")]
@@ -68,11 +69,13 @@ class Results:
 
         write_ply(self._new(f"{self.command}.ply"), self._placed(moved), self.faces, self.subject.in_file_order(colors))
 
-    def shape(self, moved: np.ndarray) -> None:
-        """Write moved vertices and the faces as OBJ, with the UV map if there is one."""
+    def shape(self, moved: np.ndarray, colors: np.ndarray | None = None) -> None:
+        """Write moved vertices and the faces as OBJ, with a UV map if there is one, and colours (V, 3) from 0 to 1."""
         from ..output.files import write_obj
 
-        write_obj(self._new(f"{self.command}.obj"), self._placed(moved), self.faces, self.subject.mesh.uv)
+        path, uv = self._new(f"{self.command}.obj"), self.subject.mesh.uv
+        ordered = None if colors is None else self.subject.in_file_order(colors)
+        write_obj(path, self._placed(moved), self.faces, uv, colors=ordered)
 
     def textured(self, image: np.ndarray) -> None:
         """Write the mesh as OBJ with an image (H, W, 3) of unsigned bytes; nothing where no image can be written."""
@@ -80,7 +83,7 @@ class Results:
 
         uv = self.subject.mesh.uv
         if self.draws and uv is not None:
-            path = self._new(f"textured/{self.command}.obj")
+            path, *_ = (self._new(f"textured/{self.command}.{ending}") for ending in ("obj", "mtl", "png"))
             write_textured_obj(path, self.vertices, self.faces, uv, image)
 
     def picture(
@@ -128,6 +131,7 @@ class Results:
             options=dict(options),
             measured=dict(measured),
             files=self.files,
+            earlier_files=[name for name in self._before if name not in self.files and (self.out / name).exists()],
             versions={package: version(package) for package in ("ltljax", "jax", "numpy")},
         )
         (self.out / self.marker).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -136,10 +140,9 @@ class Results:
         """Where a file goes."""
         path = self.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        if not self.files:
-            # First of all, so that what is left of an interrupted command may be replaced.
-            self._mark({}, {})
         self.files.append(name)
+        # First of all, so that what is left of an interrupted command may be replaced.
+        self._mark({}, {})
         return path
 
     def _picture(self, name: str) -> str:

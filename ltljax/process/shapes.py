@@ -14,9 +14,9 @@ from .. import imaging
 from ..mesh.columns import read_colors
 from ..operators import curvature as curvature_of
 from ..solve import geodesic_distance
-from .fields import line_fields
+from .fields import FIELDS, line_fields
 from .results import Results, symmetric, usual
-from .subject import Subject, load
+from .subject import Subject, check_choice, check_positive, load
 
 SMOOTHINGS = ("flow", "fair", "features")
 # What is smoothed where nothing is said, in squared edge lengths: waves of an edge or two go.
@@ -56,6 +56,8 @@ def smooth(
         ValueError: the mesh is not acceptable, or the method does not take what is given.
         SolveError: a step could not be solved, as where the surface collapses.
     """
+    check_choice("method", method, SMOOTHINGS)
+    check_positive(time=time, strength=strength, steps=steps)
     takes = dict(
         flow=("time", "steps", "keep_volume"), fair=("strength", "keep_volume"), features=("strength", "steps")
     )
@@ -69,27 +71,26 @@ def smooth(
     surface, square = subject.surface, subject.edge**2
     how: dict[str, Any]
     if method == "flow":
-        how = dict(time=time or _TIME * square, steps=steps or 10)
+        how = dict(time=_TIME * square if time is None else time, steps=10 if steps is None else steps)
         moved = imaging.mean_curvature_flow(surface, how["time"], how["steps"], keep_volume)
     elif method == "fair":
-        how = dict(strength=strength or _STRENGTH * square)
+        how = dict(strength=_STRENGTH * square if strength is None else strength)
         moved = imaging.fair(surface, how["strength"], keep_volume=keep_volume)
     else:
-        how = dict(strength=strength or 0.35, steps=steps or 5)
+        how = dict(strength=0.35 if strength is None else strength, steps=5 if steps is None else steps)
         moved = imaging.denoise_mesh(surface, how["strength"], normal_iterations=how["steps"])
     after = np.asarray(moved)
     bends = [np.asarray(curvature_of(at).mean) for at in (surface, surface.with_vertices(moved))]
     way = np.linalg.norm(after - np.asarray(surface.vertices), axis=1)
     results.numbers({"mean_before": bends[0], "mean_after": bends[1], "way": way}, after)
     kind = subject.path.suffix.lower() if subject.path else ".ply"
+    own = read_colors(subject.path) if subject.path else None
+    own = None if own is None else np.clip(subject.pulled(own, subject.name), 0, 1)
     if kind == ".obj":
-        results.shape(after)
+        results.shape(after, own)
     else:
-        own = read_colors(subject.path) if subject.path else None
         grey = np.full((len(after), 3), 200, np.uint8)
-        results.colors(
-            grey if own is None else np.round(255 * subject.pulled(own, subject.name)).astype(np.uint8), after
-        )
+        results.colors(grey if own is None else np.round(255 * own).astype(np.uint8), after)
     # The noise of the mesh before bends far more than its shape does.
     limits = symmetric(bends[1])
     for name, values, at in (("before", bends[0], None), ("after", bends[1], after)):
@@ -113,8 +114,9 @@ def lic(mesh: str, out: Path, *, field: str = "smallest", resolution: int = 600,
         repair: mend a mesh file that is not acceptable.
 
     Raises:
-        ValueError: the mesh is not acceptable.
+        ValueError: the mesh is not acceptable, there is no such field, or it has no direction on this mesh.
     """
+    check_choice("field", field, FIELDS)
     subject = load(mesh, repair)
     results = Results("lic", subject, out, ("",))
     surface, is_directed = subject.surface, field == "rotation"

@@ -5,6 +5,7 @@ What enters: names of files. What leaves: a `Subject`, and values in the order o
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,21 @@ class Subject:
             if self.mesh.welded_index[number] < 0:
                 raise ValueError(f"Vertex {number} of {self.name} belongs to no face. Name another.")
         return self.mesh.welded_index[numbers]
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise where an option is none of its choices."""
+    if value not in choices:
+        raise ValueError(f"Expected as {name} one of {', '.join(choices)}, found {value!r}.")
+
+
+def check_positive(**options: float | None) -> None:
+    """Raise where one of the options that are given is not positive and finite."""
+    for name, value in options.items():
+        if value is not None and not 0 < value < np.inf:
+            raise ValueError(
+                f"Expected {name} to be positive and finite, found {value}. Leave it away for the default."
+            )
 
 
 def load(name: str, repair: bool) -> Subject:

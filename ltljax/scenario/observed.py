@@ -122,6 +122,6 @@ def _vertices(here: np.ndarray | None, mesh: Mesh, table: Table) -> np.ndarray |
 def _columns(path: Path, table: Table) -> dict[str, np.ndarray]:
     """The arrays of a file, by name."""
     try:
-        return read_columns(path)
+        return {name: np.asarray(values, np.float64) for name, values in read_columns(path).items()}
     except DataError as error:
         raise table.error("file", error.expected) from None

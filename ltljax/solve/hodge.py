@@ -70,7 +70,11 @@ def harmonic_fields(surface: Surface) -> HarmonicFields:
             "Harmonic fields are found on the host, but the surface is being traced by a JAX transformation. Compute "
             "them outside and hand them to ltl.helmholtz_hodge."
         )
-    number = _number_of_handles(surface)
+    with jax.ensure_compile_time_eval():  # inside jit too, of a surface that is not traced
+        return _harmonic(surface, _number_of_handles(surface))
+
+
+def _harmonic(surface: Surface, number: int) -> HarmonicFields:
     if number == 0:
         return HarmonicFields(jnp.zeros((0, surface.num_vertices, 3), surface.dtype), surface.mass)
     gauss = np.asarray(curvature(surface).gauss, np.float64)
@@ -148,14 +152,24 @@ def _parts(surface: Surface, X: Array, potential: Array, stream: Array, harmonic
 
 
 def _number_of_handles(surface: Surface) -> int:
-    faces = np.asarray(surface.faces)
+    """Of all components together, which are closed or disks."""
+    topology = surface.topology
+    faces, components = np.asarray(topology.faces), np.asarray(topology.components)
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
-    characteristic = surface.num_vertices - len(edges) + len(faces)
-    loops, parts = surface.topology.num_loops, surface.topology.num_components
-    handles = (2 * parts - loops - characteristic) // 2
-    if loops and (handles or loops > parts):
+    vertices, edges_of, faces_of = (
+        np.bincount(part, minlength=topology.num_components)
+        for part in (components, components[edges[:, 0]], components[faces[:, 0]])
+    )
+    rims = np.unique(np.stack([np.asarray(topology.loops), components[np.asarray(topology.boundary)]]), axis=1)
+    loops = np.bincount(rims[1], minlength=topology.num_components)
+    handles = (2 - loops - (vertices - edges_of + faces_of)) // 2
+    is_bad = (loops > 1) | ((loops > 0) & (handles > 0))
+    if is_bad.any():
+        first = int(np.argmax(is_bad))
+        rim, handle = int(loops[first]), int(handles[first])
+        where = f" on component {first}" if topology.num_components > 1 else ""
         raise ValueError(
-            f"Expected a closed surface or disks, found {loops} boundary loop{'s' * (loops > 1)} on {parts} "
-            f"component{'s' * (parts > 1)} with {handles} handle{'s' * (handles != 1)}."
+            f"Expected closed surfaces or disks, found {rim} boundary loop{'s' * (rim > 1)} and {handle} "
+            f"handle{'s' * (handle != 1)}{where}."
         )
-    return handles
+    return int(handles.sum())

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ..equations import VectorDiffusion
@@ -40,22 +42,24 @@ def transport_vectors(
     """Vectors at some vertices carried over the whole surface: every vertex takes that of the nearest (host).
 
     Parallel transport along shortest paths, by one backward Euler step of vector heat whose direction counts; lengths
-    come from scalar heat. Sources are spread over a few edges, which halves the error. Second order, where shortest
-    paths are unique. Which vertex takes what from whom is found on the host by sparse elimination, which keeps its
-    relative accuracy where heat is tiny; from there on it is JAX, differentiable in the vectors.
+    come from scalar heat. Sources are spread over a few edges: one vertex is not seen exactly where it is. On spheres
+    of 2,562 to 10,242 vertices errors are .05 to .4 degrees (benchmarks/imaging.md) and fall more slowly than the mesh
+    size, as the step is tied to it. Which vertex takes what from whom is found on the host by sparse elimination, which
+    keeps its relative accuracy where heat is tiny; from there on it is JAX, differentiable in the vectors. Takes 24
+    bytes for each vertex and source, and a multiple of that while it is found.
 
     Args:
         surface: a `Monotone` surface.
         sources: indices of n vertices, or one.
         vectors: (n, 3), or (3,) for one; tangent.
-        time: of the step; by default four times the square of the mean distance of neighbours.
+        time: of the step, positive; by default four times the square of the mean distance of neighbours.
 
     Returns:
         (V, 3); zero on a component without a source.
 
     Raises:
-        ValueError: sources are not on the surface, vectors do not fit them or are not tangent, or the surface is being
-            traced.
+        ValueError: sources are not on the surface, vectors do not fit them or are not tangent, the time is not
+            positive, or the surface is being traced.
 
     Source: Sharp, Soliman and Crane (2019), The vector heat method, doi:10.1145/3243651.
     """
@@ -66,12 +70,16 @@ def transport_vectors(
     sources = np.atleast_1d(np.asarray(sources))
     if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
         raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
-    vectors = jnp.asarray(vectors, surface.dtype).reshape(-1, 3) if vectors.shape == (3,) else vectors
+    if time is not None and not time > 0:
+        raise ValueError(f"Expected a positive time, found {time}.")
+    vectors = jnp.asarray(vectors, surface.dtype)
+    vectors = vectors[None] if vectors.shape == (3,) else vectors
     if vectors.shape != (len(sources), 3):
         raise ValueError(f"Expected a vector for each of {len(sources)} sources, found shape {vectors.shape}.")
     everywhere = jnp.zeros((surface.num_vertices, 3), surface.dtype).at[sources].set(vectors)
     check_tangent(surface, everywhere)
-    carried, heat = _responses(surface, sources, _STEP * shortest_step(surface) if time is None else time)
+    with jax.ensure_compile_time_eval():  # inside jit too, of a surface that is not traced
+        carried, heat = _responses(surface, sources, _STEP * shortest_step(surface) if time is None else time)
     return _mixed(surface, sources, vectors, carried, heat)
 
 
@@ -151,7 +159,8 @@ def _step(operator: Any, time: float) -> Any:
 
 def connection_matrix(surface: Surface, symmetry: int = 1) -> scipy.sparse.csr_array:
     """The vector Laplacian as a complex sparse matrix (V, V) on the components in the frames (host)."""
-    along = connection(surface, symmetry)
+    with jax.ensure_compile_time_eval():
+        along = connection(surface, symmetry)
     x, y = (difference_matrix(along.table, weights).astype(np.float64) for weights in along.turned)
     left = np.asarray(along.centre, np.float64)
     return scipy.sparse.csr_array(x + 1j * y + scipy.sparse.diags_array(left[0] + 1j * left[1]))
@@ -173,8 +182,8 @@ def direction_field(
         time: for which a guide diffuses: details finer than its square root vanish.
 
     Raises:
-        ValueError: a guide without a time or a time without a guide; the guide does not fit or is not tangent; without
-            a guide, the surface is being traced.
+        ValueError: a guide without a time or a time without a guide; the guide does not fit, is not tangent, or
+            vanishes on a component; without a guide, the surface is being traced.
 
     Source: Knoppel, Crane, Pinkall and Schroder (2013), Globally optimal direction fields,
     doi:10.1145/2461912.2462005.
@@ -184,6 +193,7 @@ def direction_field(
     if guide is None or time is None:
         raise ValueError("Expected a guide and the time for which it is smoothed, or neither for the smoothest field.")
     check_tangent(surface, guide)
+    _points_somewhere(surface, guide)
     z = to_frame(surface, jnp.asarray(guide, surface.dtype))
     size = jnp.sqrt(jnp.maximum(jnp.sum(z**2, axis=-1, keepdims=True), jnp.finfo(z.dtype).tiny))
     raised = from_frame(surface, size * power(z / size, symmetry))
@@ -204,8 +214,28 @@ def _smoothest(surface: Surface, symmetry: int) -> np.ndarray:
             "The smoothest field is found on the host, but the surface is being traced by a JAX transformation. "
             "Compute it outside, or hand in a guide."
         )
-    z = lowest(-connection_matrix(surface, symmetry), 1, _SHIFT / float(np.asarray(surface.vertex_areas).sum()))[0]
+    matrix, components = -connection_matrix(surface, symmetry), np.asarray(surface.topology.components)
+    areas = np.bincount(components, np.asarray(surface.vertex_areas))
+    z = np.zeros(len(components), np.complex128)
+    for component, area in enumerate(areas):
+        here = np.flatnonzero(components == component)
+        z[here] = lowest(matrix[here][:, here], 1, _SHIFT / area)[0]
     return np.stack([z.real, z.imag], axis=-1)
+
+
+def _points_somewhere(surface: Surface, guide: AnyArray) -> None:
+    """Raise where a guide vanishes on a whole component, which is then left without a direction."""
+    if isinstance(guide, Tracer) or surface.is_traced:
+        return
+    components = np.asarray(surface.topology.components)
+    longest = np.zeros(surface.topology.num_components)
+    np.maximum.at(longest, components, np.linalg.norm(np.asarray(guide, np.float64), axis=1))
+    if not (longest > 0).all():
+        where = f"component {int(np.argmin(longest))}" if len(longest) > 1 else "the surface"
+        raise ValueError(
+            f"Expected a guide that points somewhere, found zero on all of {where}. Without a guide the smoothest "
+            "field is taken."
+        )
 
 
 def lowest(matrix: Any, number: int, shift: float) -> Any:
