@@ -3,6 +3,7 @@
 import functools
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,9 +45,7 @@ def geodesic_distance(
         raise ValueError(
             "The distance is computed on the host, but the surface is being traced by a JAX transformation."
         )
-    sources = np.atleast_1d(np.asarray(sources))
-    if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
-        raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
+    sources = checked_sources(surface, sources)
     here = np.zeros(surface.num_vertices)
     here[sources] = 1
     step = shortest_step(surface) if time is None else time
@@ -67,6 +66,18 @@ def geodesic_distance(
     for component in np.unique(components[sources]):
         nearest[component] = np.asarray(distance)[sources[components[sources] == component]].min()
     return distance - jnp.asarray(nearest[components], surface.dtype)
+
+
+def checked_sources(surface: Surface, sources: Any) -> np.ndarray:
+    """Source vertices as an array.
+
+    Raises:
+        ValueError: there are none, or they are not on the surface.
+    """
+    sources = np.atleast_1d(np.asarray(sources))
+    if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
+        raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
+    return sources
 
 
 def shortest_step(surface: Surface) -> float:

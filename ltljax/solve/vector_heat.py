@@ -22,7 +22,7 @@ from ..operators import laplacian_matrix
 from ..surface import Surface
 from ..tables import AnyArray, difference_matrix
 from ..vectors import check_tangent, connection, from_frame, power, to_frame
-from .distance import shortest_step
+from .distance import checked_sources, shortest_step
 from .evolve import solve
 
 # The step of heat, over the shortest that tells shortest paths, and the width of what replaces a source, over the mean
@@ -67,9 +67,7 @@ def transport_vectors(
         raise ValueError(
             "Vector heat is computed on the host, but the surface is being traced by a JAX transformation."
         )
-    sources = np.atleast_1d(np.asarray(sources))
-    if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
-        raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
+    sources = checked_sources(surface, sources)
     if time is not None and not time > 0:
         raise ValueError(f"Expected a positive time, found {time}.")
     vectors = jnp.asarray(vectors, surface.dtype)
