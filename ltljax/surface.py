@@ -249,6 +249,12 @@ class Surface(eqx.Module):
         return kept[name]
 
     @property
+    def mesh_size(self) -> Float[Array, ""]:
+        """The mean length of the edges of the faces: those inside count twice."""
+        corners = self.vertices[self.faces]
+        return jnp.mean(jnp.linalg.norm(corners - jnp.roll(corners, 1, axis=1), axis=-1))
+
+    @property
     def num_vertices(self) -> int:
         """Number of vertices."""
         return self.topology.ring.num_vertices

@@ -11,7 +11,6 @@ import ltljax as ltl
 from ltljax import imaging
 from ltljax.imaging import minimiser
 from ltljax.imaging.minimiser import Faces, Functional
-from ltljax.imaging.signals import spacing
 from ltljax.imaging.variation import flatness
 
 # Two vertices of Spot have no consistent row.
@@ -37,7 +36,7 @@ class Scene:
         self.x = np.asarray(mesh.vertices)
         self.clean = cartoon(self.x)
         self.noisy = self.clean + NOISE * np.random.default_rng(0).normal(size=len(self.x))
-        self.edge = float(spacing(self.surface))
+        self.edge = float(self.surface.mesh_size)
 
     def decibels(self, u):
         return float(imaging.psnr(self.surface, u, self.clean))
@@ -341,7 +340,7 @@ def test_coherence_enhancing_closes_gaps_in_lines():
     x, y, _ = np.asarray(surface.vertices).T
     lines = np.sin(6 * np.pi * y)
     broken = np.where(np.abs(x - 0.5) < 0.05, 0.0, lines)
-    edge = float(spacing(surface))
+    edge = float(surface.mesh_size)
     closed = imaging.coherence_enhancing(surface, broken, 20 * edge**2, 1.0, rounds=2)
     inside = (np.abs(x - 0.5) < 0.05) & (np.abs(y - 0.5) < 0.4)
     assert np.corrcoef(np.asarray(closed)[inside], lines[inside])[0, 1] > 0.9

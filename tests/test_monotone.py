@@ -252,3 +252,8 @@ def test_inconsistent_rows_of_real_meshes_are_rare_and_counted(name, at_most, re
     report = ltl.Surface.from_mesh(ltl.load_mesh(real_mesh(name))).report
     assert len(report.inconsistent) <= at_most
     assert f"{len(report.inconsistent)}" in str(report).split("inconsistent Laplacian rows")[1].split("\n")[0]
+
+
+def test_the_mesh_size_of_a_closed_surface_is_that_of_its_mesh():
+    mesh = ltl.shapes.jittered_sphere(2, 0.4)
+    np.testing.assert_allclose(ltl.Surface.from_mesh(mesh).mesh_size, mesh.mesh_size, rtol=1e-12)

@@ -19,7 +19,7 @@ from ..equations import Equation
 from ..operators import divergence, gradient
 from ..surface import Surface
 from ..tables import AnyArray
-from .signals import number, signal, spacing
+from .signals import number, signal
 from .smoothing import evolved, smoothed
 
 # Weickert's constant: with it the flux grows with the slope up to the contrast, and falls beyond.
@@ -193,7 +193,7 @@ def edge_enhancing(
     Raises:
         ValueError: as `anisotropic_diffusion`.
     """
-    scale = spacing(surface) if scale is None else scale
+    scale = surface.mesh_size if scale is None else scale
     # Edges are where they are: the products are not averaged.
     return _in_rounds(surface, u, time, rounds, lambda u: _tensor(surface, u, contrast, scale, 0.0, "edges"), options)
 
@@ -223,7 +223,7 @@ def coherence_enhancing(
     Raises:
         ValueError: as `anisotropic_diffusion`.
     """
-    scale = spacing(surface) if scale is None else number(surface, "scale", scale)
+    scale = surface.mesh_size if scale is None else number(surface, "scale", scale)
     wide = 3 * scale if integration_scale is None else integration_scale
     return _in_rounds(
         surface, u, time, rounds, lambda u: _tensor(surface, u, contrast, scale, wide, "coherence"), options

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..surface import Surface
 from ..tables import AnyArray
-from .signals import number, same_shape, signal, spacing
+from .signals import number, same_shape, signal
 from .smoothing import smoothed
 
 # The window of Wang et al. has a standard deviation of one and a half pixels, and these keep quotients from zero.
@@ -79,7 +79,7 @@ def ssim(
     """
     u, reference = _pair(surface, u, reference)
     peak = _peak(surface, reference, peak)
-    radius = _RADIUS * spacing(surface) if radius is None else number(surface, "radius", radius)
+    radius = _RADIUS * surface.mesh_size if radius is None else number(surface, "radius", radius)
     x, y = (image.reshape(len(image), -1) for image in (u, reference))
     # Variances do not know of a constant, and rounding does.
     middle = jnp.mean(y)

@@ -18,7 +18,7 @@ from ..solve.implicit import Jacobi
 from ..solve.krylov import linear_solve
 from ..surface import Surface
 from ..tables import AnyArray
-from .signals import check, number, signal, spacing
+from .signals import check, number, signal
 
 # Each linear system is solved to this share of its right side, which is small itself near the end.
 _SHARE = 1e-4
@@ -88,7 +88,7 @@ def segment(
     u = signal(surface, u)
     if not isinstance(u, Tracer) and not np.ptp(np.asarray(u).reshape(len(u), -1), axis=0).max() > 0:
         raise ValueError("The image is constant, so that there are no two regions to be told apart.")
-    wide = _WIDTH * spacing(surface) if width is None else number(surface, "width", width)
+    wide = _WIDTH * surface.mesh_size if width is None else number(surface, "width", width)
     least = _SCALE * wide if scale is None else number(surface, "scale", scale)
     enough = jnp.asarray(_TOLERANCE[jnp.dtype(u.dtype)] if tolerance is None else tolerance, u.dtype)
     phi, means, found = _segmented(surface, u.reshape(len(u), -1), wide, least, enough, max_steps)

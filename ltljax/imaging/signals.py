@@ -81,12 +81,6 @@ def missing(surface: Surface, mask: AnyArray) -> Bool[Array, " V"]:
     return jnp.asarray(mask)
 
 
-def spacing(surface: Surface) -> Float[Array, ""]:
-    """The mean length of the edges."""
-    corners = surface.vertices[surface.faces]
-    return jnp.mean(jnp.linalg.norm(corners - jnp.roll(corners, 1, axis=1), axis=-1))
-
-
 def check(what: str, found: Array) -> None:
     """Raise where an iteration outside of jit did not find what it was after."""
     if not isinstance(found, Tracer) and not bool(found):

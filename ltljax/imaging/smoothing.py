@@ -20,7 +20,7 @@ from ..solve.krylov import linear_solve
 from ..solve.stabilised import RKL1
 from ..surface import Surface
 from ..tables import AnyArray
-from .signals import check, number, signal, spacing
+from .signals import check, number, signal
 
 _EXACT = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 _MAX_ITERATIONS = 1000
@@ -157,7 +157,7 @@ def perona_malik(
         ValueError: u does not fit the surface or is not finite, or a number is negative.
     """
     u = signal(surface, u)
-    scale = spacing(surface) if scale is None else number(surface, "scale", scale, may_be_zero=True)
+    scale = surface.mesh_size if scale is None else number(surface, "scale", scale, may_be_zero=True)
     equation = PeronaMalik(number(surface, "contrast", contrast), scale)
     return evolved(equation, surface, u, time, solver, rtol)
 

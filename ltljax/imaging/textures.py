@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..mesh import Mesh
-from .views import _axes
+from .views import axes_of
 
 # As near to the rim of the image, in its size, a place counts as on it.
 _RIM = 1e-4
@@ -76,7 +76,7 @@ def project_image(
     Raises:
         ValueError: the direction is along ``up``, or the image is no image.
     """
-    pixels, axes = _pixels(image), _axes(direction, up)
+    pixels, axes = _pixels(image), axes_of(direction, up)
     vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, np.float64)
     seen = vertices @ axes[:2].T
     low, span = seen.min(axis=0), np.ptp(seen, axis=0)

@@ -179,13 +179,13 @@ def most_crossings(surface: Surface, length: float, step: float) -> int:
 
 
 def mean_edge(surface: Surface) -> float:
-    """The mean length of the edges, those inside counted twice (host)."""
+    """The mesh size as a number (host)."""
     if surface.is_traced or isinstance(surface.faces, Tracer):
         raise ValueError(
             "Lengths are chosen on the host, but the surface is being traced by a JAX transformation. Give step= and "
             "length= as numbers."
         )
-    return float(_edges(surface).mean())
+    return float(surface.mesh_size)
 
 
 def _edges(surface: Surface) -> np.ndarray:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..surface import Surface
 from ..tables import AnyArray
 from .minimiser import Faces, Functional, minimise
-from .signals import check, number, signal, spacing
+from .signals import check, number, signal
 
 # Of the last step of Newton's method, relative to the standard deviation of the image; and of the mean square that the
 # noise is to explain, relative.
@@ -158,7 +158,7 @@ def _denoise(
             mean_square = jnp.sum(areas[:, None] * (u - columns) ** 2) / total
             return jnp.log(jnp.maximum(mean_square, jnp.finfo(f.dtype).tiny) / explained), u, found
 
-        guess = jnp.log(noise * spacing(surface))
+        guess = jnp.log(noise * surface.mesh_size)
         log_strength, start, is_matched = jax.lax.stop_gradient(
             _root(excess, guess, columns, _MATCH[jnp.dtype(f.dtype)])
         )

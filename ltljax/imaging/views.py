@@ -58,7 +58,7 @@ def look(
     Raises:
         ValueError: the view is along ``up``, or there are no pixels.
     """
-    axes = _axes(view, up)
+    axes = axes_of(view, up)
     if resolution < 1:
         raise ValueError(f"Expected a positive resolution, found {resolution}.")
     placed = vertices @ axes.T
@@ -83,7 +83,12 @@ def look(
     return View(mask.reshape(resolution, resolution), face[mask], weights[mask], pixel, axes)
 
 
-def _axes(view: Sequence[float | int], up: Sequence[float | int]) -> np.ndarray:
+def axes_of(view: Sequence[float | int], up: Sequence[float | int]) -> np.ndarray:
+    """What points right, up and towards the eye, unit vectors as rows (3, 3).
+
+    Raises:
+        ValueError: the view is along ``up``.
+    """
     towards, upwards = np.asarray(view, np.float64), np.asarray(up, np.float64)
     right = np.cross(upwards, towards)
     if not np.linalg.norm(right) > 1e-8 * np.linalg.norm(towards) * np.linalg.norm(upwards):

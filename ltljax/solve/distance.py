@@ -81,10 +81,9 @@ def checked_sources(surface: Surface, sources: Any) -> np.ndarray:
 
 
 def shortest_step(surface: Surface) -> float:
-    """The time of a step of heat that tells shortest paths: the square of the mean distance of neighbours (host)."""
-    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces)
-    mean = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean()
-    return float(max(mean, 2 * np.linalg.norm(np.ptp(vertices, axis=0)) / _DECAY)) ** 2
+    """The time of a step of heat that tells shortest paths (host): the squared mesh size, or what float64 can hold."""
+    diameter = float(np.linalg.norm(np.ptp(np.asarray(surface.vertices, np.float64), axis=0)))
+    return max(float(surface.mesh_size), 2 * diameter / _DECAY) ** 2
 
 
 @eqx.filter_jit

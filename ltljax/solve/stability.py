@@ -232,7 +232,7 @@ def explain(
         )
         return Explanation(False, found, 0, float("inf"), float("inf"), message)
     count, known = _count_modes(surface, band)
-    wavelength, edge = found.wavelength, _mean_edge(surface)
+    wavelength, edge = found.wavelength, float(surface.mesh_size)
     edges = wavelength / edge
     shape = (
         f"modes with eigenvalues of -Delta from {band[0]:.4g} to {band[1]:.4g} grow out of the uniform state "
@@ -291,9 +291,3 @@ def _count_modes(surface: Surface, band: tuple[float, float]) -> tuple[int, bool
         return round(min(estimate, surface.num_vertices)), False
     values = np.asarray(eigenmodes(surface, wanted).values)
     return int(((values > low) & (values < high)).sum()), True
-
-
-def _mean_edge(surface: Surface) -> float:
-    """The mean length of the edges of faces."""
-    faces, vertices = np.asarray(surface.faces), np.asarray(surface.vertices, np.float64)
-    return float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
