@@ -4,6 +4,7 @@ What enters: a checked `Mesh` and a scheme. What leaves: topology tables and wei
 everything is a pure function of them.
 """
 
+import contextlib
 import dataclasses
 import functools
 import warnings
@@ -250,9 +251,12 @@ class Surface(eqx.Module):
 
     @property
     def mesh_size(self) -> Float[Array, ""]:
-        """The mean length of the edges of the faces: those inside count twice."""
-        corners = self.vertices[self.faces]
-        return jnp.mean(jnp.linalg.norm(corners - jnp.roll(corners, 1, axis=1), axis=-1))
+        """The mean length of the edges of the faces: those inside count twice. A constant where nothing is traced."""
+        # Inside jit even the vertices of a surface from outside would give a traced length.
+        known = not (self.is_traced or isinstance(self.faces, Tracer))
+        with jax.ensure_compile_time_eval() if known else contextlib.nullcontext():
+            corners = self.vertices[self.faces]
+            return jnp.mean(jnp.linalg.norm(corners - jnp.roll(corners, 1, axis=1), axis=-1))
 
     @property
     def num_vertices(self) -> int:

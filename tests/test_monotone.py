@@ -1,5 +1,6 @@
 """`ltl.Monotone()`: consistent, never negative, stable, and as accurate as measured before."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -256,4 +257,10 @@ def test_inconsistent_rows_of_real_meshes_are_rare_and_counted(name, at_most, re
 
 def test_the_mesh_size_of_a_closed_surface_is_that_of_its_mesh():
     mesh = ltl.shapes.jittered_sphere(2, 0.4)
-    np.testing.assert_allclose(ltl.Surface.from_mesh(mesh).mesh_size, mesh.mesh_size, rtol=1e-12)
+    surface = ltl.Surface.from_mesh(mesh)
+    np.testing.assert_allclose(surface.mesh_size, mesh.mesh_size, rtol=1e-12)
+    # A number where only something else is traced, and traced with the vertices.
+    assert jax.jit(lambda x: float(surface.mesh_size) * x)(1.0) == surface.mesh_size
+    x = surface.vertices
+    slope = jax.jit(jax.grad(lambda s: surface.with_vertices(s * x).mesh_size))(1.0)
+    np.testing.assert_allclose(slope, surface.mesh_size, rtol=1e-12)

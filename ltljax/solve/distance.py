@@ -1,6 +1,7 @@
 """Geodesic distance by the heat method: a little diffusion, its direction, and the potential with that gradient."""
 
 import functools
+import math
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -19,6 +20,9 @@ from .stationary import IncompatibleSourceWarning, poisson
 
 # The heat at a distance d is about exp(-d / sqrt(time)); over the size of the surface it must not leave float64.
 _DECAY = 500
+# Times the slope of the logarithm of heat, 1 / sqrt(time): below it a descent is what rounding left where two shortest
+# paths meet, and has no direction.
+_NO_DIRECTION = 1e-3
 
 
 def geodesic_distance(
@@ -37,7 +41,8 @@ def geodesic_distance(
 
     Raises:
         SolveError: the potential was not found.
-        ValueError: there are no sources, or not on the surface, or the surface is being traced.
+        ValueError: there are no sources, or not on the surface, the time is not positive, or the surface is being
+            traced.
 
     Source: Crane, Weischedel and Wardetzky (2013), Geodesics in heat, doi:10.1145/2516971.2516977.
     """
@@ -46,6 +51,8 @@ def geodesic_distance(
             "The distance is computed on the host, but the surface is being traced by a JAX transformation."
         )
     sources = checked_sources(surface, sources)
+    if time is not None and not time > 0:
+        raise ValueError(f"Expected a positive time, found {time}.")
     here = np.zeros(surface.num_vertices)
     here[sources] = 1
     step = shortest_step(surface) if time is None else time
@@ -59,7 +66,7 @@ def geodesic_distance(
     with warnings.catch_warnings():
         # Where the distance has kinks the mean is not that of a divergence.
         warnings.simplefilter("ignore", IncompatibleSourceWarning)
-        distance = poisson(surface, _divergence(surface, descent, is_source))
+        distance = poisson(surface, _divergence(surface, math.sqrt(step) * descent, is_source))
     # A potential is known up to a constant on every component.
     components = np.asarray(surface.topology.components)
     nearest = np.full(surface.topology.num_components, -np.inf)
@@ -90,12 +97,13 @@ def shortest_step(surface: Surface) -> float:
 def _divergence(surface: Surface, descent: Array, here: Array) -> Array:
     """What the Laplacian makes of a potential that rises along edges as a unit field X in the direction of descent.
 
-    That is sum_k c_k (X_v + X_k) / 2 . (x_k - x_v); at the sources, where X has no direction, that of the other end of
-    an edge counts for both.
+    The descent is about one long where one shortest path arrives, and X is zero where it is almost none. That is
+    sum_k c_k (X_v + X_k) / 2 . (x_k - x_v); at the sources, where X has no direction, that of the other end of an edge
+    counts for both.
     """
     x, L = surface.vertices, functools.partial(laplacian, surface)
-    size = jnp.linalg.norm(descent, axis=-1, keepdims=True)
-    X = jnp.where(here[:, None] > 0, 0, descent / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
+    size = jnp.sqrt(jnp.sum(descent**2, axis=-1, keepdims=True) + _NO_DIRECTION**2)
+    X = jnp.where(here[:, None] > 0, 0, descent / size)
     rises = (jnp.sum(X * L(x), axis=-1) + L(jnp.sum(X * x, axis=-1)) - jnp.sum(L(X) * x, axis=-1)) / 2
     to_source = jnp.sum(X * (L(here[:, None] * x) - L(here)[:, None] * x), axis=-1) / 2
     return jnp.where(here > 0, 2 * rises, rises + to_source)
