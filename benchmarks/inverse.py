@@ -2,13 +2,15 @@
 
 python benchmarks/inverse.py [--parts gradient solves starts]
 
-Gradients are of the mean square of a final state with respect to a source field, Schnakenberg's reaction and fixed
-steps of the default solver, by recursive checkpointing (the default adjoint). Times are medians of the second call on,
-forward and gradient in turns; memory is what XLA reserves beside arguments and results. SciPy's `least_squares` takes
-finite differences of the same compiled model.
+Gradients are of the mean square of a final state with respect to a source field, Schnakenberg's reaction and steps of
+the default solver, by the default adjoint and by diffrax's recursive checkpoints, whose number is the root of twice the
+steps allowed. Times are medians of the second call on, all in turns; memory is what XLA reserves beside arguments and
+results. SciPy's `least_squares` takes finite differences of the same compiled model.
 """
 
 import argparse
+import functools
+import math
 import time
 import warnings
 
@@ -16,6 +18,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import diffrax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
@@ -23,10 +26,10 @@ from scipy import optimize  # noqa: E402
 
 import ltljax as ltl  # noqa: E402
 
-# Level of the icosphere, steps, unknowns (None: one for each vertex and species).
+# Level of the icosphere, fixed steps or the end of a run of adaptive ones, unknowns (None: one for each vertex).
 RUNS = (
     (5, 250, None), (5, 1000, None), (5, 4000, None), (5, 8000, None),
-    (5, 1000, 1), (5, 1000, 100), (4, 1000, None), (6, 1000, None),
+    (5, 1000, 1), (5, 1000, 100), (4, 1000, None), (6, 1000, None), (4, 0.5, None), (4, 5.0, None), (5, 0.5, None),
 )  # fmt: skip
 ROUNDS = 5
 
@@ -49,37 +52,45 @@ def start_of(surface):
 def gradient():
     print(
         "### A gradient over a forward run\n\n"
-        "| vertices | steps | unknowns | forward (s) | gradient (s) | ratio | forward (MB) | gradient (MB) | "
-        "compile (s) |\n" + "| --- " * 9 + "|"
+        "| vertices | steps | unknowns | forward (s) | gradient (s) | ratio | MB | compile (s) | "
+        "diffrax's checkpoints: ratio | MB | compile (s) |\n" + "| --- " * 11 + "|"
     )
-    for level, steps, unknowns in RUNS:
+    for level, length, unknowns in RUNS:
         surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
-        u0, dt = start_of(surface), 2e-4
+        u0, steps = start_of(surface), length if isinstance(length, int) else None
         size = surface.num_vertices if unknowns is None else unknowns
         # Unknowns are the values of a field that is constant over runs of vertices.
         owner = np.arange(surface.num_vertices) * size // surface.num_vertices
+        end, how = (length, {}) if steps is None else (2e-4 * steps, dict(dt=2e-4))
 
-        def loss(field, surface, u0, owner=owner, dt=dt, steps=steps):
+        def loss(field, surface, u0, adjoint, owner=owner, end=end, how=how):
             a = jnp.take(field, owner)
             equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(a, 0.9, rate=30.0))
-            return jnp.mean(ltl.solve(equation, surface, u0, steps * dt, solver=ltl.RKL2(), dt=dt).u_end ** 2)
+            found = ltl.solve(equation, surface, u0, end, None, ltl.RKL2(), adjoint, **how)
+            return jnp.mean(found.u_end**2), found.counts["num_steps"]
 
-        field = jnp.full(size, 0.1)
-        begin = time.perf_counter()
-        forward = jax.jit(loss).lower(field, surface, u0).compile()
-        reverse = jax.jit(jax.value_and_grad(loss)).lower(field, surface, u0).compile()
-        compiling = time.perf_counter() - begin
-        seconds = {forward: [], reverse: []}
-        for _ in range((2 if steps > 1000 else ROUNDS) + 1):
-            for run, found in seconds.items():
+        field, runs, compiling = jnp.full(size, 0.1), [], []
+        checkpoints = diffrax.RecursiveCheckpointAdjoint(checkpoints=math.isqrt(2 * (steps or 1_000_000)) + 1)
+        for adjoint, function in (
+            (None, loss), (None, jax.value_and_grad(loss, has_aux=True)),
+            (checkpoints, jax.value_and_grad(loss, has_aux=True)),
+        ):  # fmt: skip
+            begin = time.perf_counter()
+            runs.append(jax.jit(functools.partial(function, adjoint=adjoint)).lower(field, surface, u0).compile())
+            compiling.append(time.perf_counter() - begin)
+        seconds, count = [[] for _ in runs], 0
+        for _ in range((2 if (steps or 0) > 1000 or level > 5 else ROUNDS) + 1):
+            for run, found in zip(runs, seconds, strict=True):
                 begin = time.perf_counter()
-                jax.block_until_ready(run(field, surface, u0))
+                out = jax.block_until_ready(run(field, surface, u0))
                 found.append(time.perf_counter() - begin)
-        there, back = (float(np.median(found[1:])) for found in seconds.values())
-        memory = [run.memory_analysis().temp_size_in_bytes / 1e6 for run in seconds]
+                count = int(out[1] if run is runs[0] else out[0][1])
+        there, back, theirs = (float(np.median(found[1:])) for found in seconds)
+        memory = [run.memory_analysis().temp_size_in_bytes / 1e6 for run in runs]
         print(
-            f"| {surface.num_vertices} | {steps} | {size} | {there:.2f} | {back:.2f} | {back / there:.2f} | "
-            f"{memory[0]:.1f} | {memory[1]:.1f} | {compiling:.1f} |",
+            f"| {surface.num_vertices} | {count}{'' if steps else ', adaptive'} | {size} | {there:.2f} | {back:.2f} | "
+            f"{back / there:.2f} | {memory[1]:.0f} | {compiling[1]:.1f} | {theirs / there:.2f} | {memory[2]:.0f} | "
+            f"{compiling[2]:.1f} |",
             flush=True,
         )
 

@@ -162,10 +162,9 @@ def fit(
 
     With up to 64 unknowns the method is Levenberg-Marquardt on the residuals; their Jacobian is taken in forward mode
     along with the run (`diffrax.ForwardMode`), or row by row of a model that has reverse mode alone and up to 64
-    values. With more it is L-BFGS on the loss, its gradient in reverse mode (`diffrax.RecursiveCheckpointAdjoint`): a
-    gradient costs a few runs, whatever the number of unknowns. A trial step for which the run fails, or that is not
-    finite, is rejected and a shorter one tried; steps of an optimiser of optax cannot be taken back, and end the fit
-    there.
+    values. With more it is L-BFGS on the loss, its gradient in reverse mode (see `solve`): a gradient costs a few
+    runs, whatever the number of unknowns. A trial step for which the run fails, or that is not finite, is rejected and
+    a shorter one tried; steps of an optimiser of optax cannot be taken back, and end the fit there.
 
     Args:
         model: an `Experiment`; or a function of the parameters that returns what the data are compared with: a

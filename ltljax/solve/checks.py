@@ -100,9 +100,10 @@ def step(
     """Raise where steps of an explicit method are too long for the stiffest mode of the first state."""
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, dt))):
         return
+    # What is traced may be reached through a closure too.
     if isinstance(solver, Stabilised):
-        bound = float(solver.spectral_bound(jnp.asarray(t0, u0.dtype), u0, (equation, surface)))
-        if dt > (longest := solver.longest_step(bound)):
+        bound = solver.spectral_bound(jnp.asarray(t0, u0.dtype), u0, (equation, surface))
+        if not isinstance(bound, Tracer) and dt > (longest := solver.longest_step(float(bound))):
             raise ValueError(
                 f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {longest:.2g} with the "
                 "most stages it takes. Take shorter steps, leave dt out for adaptive ones, or use ltl.TRBDF2()."
@@ -110,9 +111,9 @@ def step(
     if not isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
         return
     reach, stiffest = real_stability(solver), _stiffest(equation, surface, u0, jnp.asarray(t0, u0.dtype))
-    if dt * stiffest > 1.02 * reach:
+    if not isinstance(stiffest, Tracer) and dt > 1.02 * (longest := reach / max(float(stiffest), 1e-30)):
         raise ValueError(
-            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {reach / stiffest:.2g} on "
+            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {longest:.2g} on "
             "this surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKL2() or ltl.TRBDF2()."
         )
 
@@ -126,10 +127,10 @@ def _power_iteration(equation: Equation, surface: Surface, u0: Array, t0: Array,
     return jnp.linalg.norm(jax.lax.fori_loop(0, _PRODUCTS, product, v))
 
 
-def _stiffest(equation: Equation, surface: Surface, u0: Array, t0: Array) -> float:
+def _stiffest(equation: Equation, surface: Surface, u0: Array, t0: Array) -> Array:
     """The magnitude of the largest eigenvalue of the rate's derivative, from below."""
     start = jnp.asarray(np.random.default_rng(0).normal(size=u0.shape), u0.dtype)
-    return float(_power_iteration(equation, surface, u0, t0, start))
+    return _power_iteration(equation, surface, u0, t0, start)
 
 
 def real_stability(solver: diffrax.AbstractSolver) -> float:

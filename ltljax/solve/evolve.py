@@ -21,11 +21,11 @@ from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..operators import growth_rate, spectral_bound
 from ..surface import Surface
 from ..tables import AnyArray
-from . import checks
+from . import checks, taped
 from .implicit import SBDF2, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
-from .stabilised import RKL2, differentiable
+from .stabilised import RKL2, Stabilised, differentiable
 from .steps import Advancing, TextMeter, without_twins
 
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
@@ -39,8 +39,7 @@ _GROWN = 1e6
 # benchmarks/time_to_accuracy.md. With a reaction they can be slower by a hundred times, where it is stiff itself.
 _STIFF = 2e3
 
-# Bytes that the checkpoints of a reverse pass may take: with one for every step none is taken a second time, and a
-# gradient costs 3.4 forward runs instead of 5.
+# Bytes that diffrax's checkpoints of a reverse pass may take: with one for every step none is taken a third time.
 _CHECKPOINTED = 2**30
 _FEWEST_CHECKPOINTS = 32
 
@@ -202,10 +201,13 @@ def solve(
         t1: the last time.
         ts: the times at which to keep the state, ascending; by default t1 alone.
         solver: a solver.
-        adjoint: how derivatives go through time; by default diffrax's recursive checkpointing, for derivatives in
-            reverse mode: fixed steps are all kept while that takes less than a gigabyte, otherwise the memory is that
-            of ``sqrt(2 max_steps)`` states and their rates, or of a gigabyte. `diffrax.ForwardMode()` for few
-            parameters.
+        adjoint: how derivatives go through time; by default in reverse mode, for `RKL2` and `RKL1` at the cost of three
+            to five runs, more with steps of more than 36 stages. Of n fixed steps some ``12 sqrt(n)`` states are then
+            kept, of adaptive ones 512, whose lengths count as given; of large states what a gigabyte holds (all of it
+            for each run of a batch). For other solvers, for dense solutions, with ``progress``, for times that are
+            traced, and where a gigabyte is too little, it is diffrax's recursive checkpointing: fixed steps are all
+            kept while that takes less than a gigabyte, otherwise the memory is that of ``sqrt(2 max_steps)`` states and
+            their rates, or of a gigabyte, and the cost 5 to 10 runs. `diffrax.ForwardMode()` for few parameters.
         progress: True for a progress bar, or a diffrax progress meter.
         t0: the first time.
         dt: the length of steps, for fixed ones; the last before each of ``ts`` may be shorter.
@@ -273,16 +275,37 @@ def solve(
         checks.step(equation, surface, u0, t0, dt, method)
     name = f"{type(method if solver is None else solver).__name__}: {why}"
     grid = _grid(t0, t1, times, dt)
+    is_taped = (
+        adjoint is None
+        and max_steps is not None
+        and (grid is None or len(grid) <= max_steps + 1)
+        and isinstance(method, Stabilised)
+        and taped.is_worth_it(None if grid is None else len(grid) - 1, u0)
+        and method.loop_kind == "checkpointed"
+        and not dense
+        and not progress
+        # In these it has no derivative.
+        and not any(isinstance(time, Tracer) for time in (t0, t1, times))
+    )
     adjoint = _checkpoints(grid, max_steps, u0) if adjoint is None else adjoint
     method = differentiable(method, adjoint)
 
     def advance(u, begin, end, times, grid):
         # Time in the state's own float type: diffrax multiplies the two.
         begin, end = jnp.asarray(begin, surface.dtype), jnp.asarray(end, surface.dtype)
-        found = _solve(
-            equation, surface, u, begin, end, times, method, adjoint, _meter(progress), relative, absolute, grid,
-            max_steps, stop_when, dense,
-        )  # fmt: skip
+        if is_taped and grid is not None:
+            spacing = taped.spacing_of(len(grid) - 1, u)
+            marks, finer = (taped.marks_of(grid, times, every) for every in (len(grid), spacing))
+            found = _fixed(equation, surface, u, grid, times, method, stop_when, marks, finer)
+        elif is_taped:
+            found = _adaptive(
+                equation, surface, u, begin, end, times, method, adjoint, relative, absolute, max_steps, stop_when
+            )
+        else:
+            found = _solve(
+                equation, surface, u, begin, end, times, method, adjoint, _meter(progress), relative, absolute, grid,
+                max_steps, stop_when, dense,
+            )  # fmt: skip
         # Said here: the numbers in it would have every run compiled anew.
         return dataclasses.replace(found, method=name)
 
@@ -411,50 +434,160 @@ def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractPr
 
 
 @eqx.filter_jit
+def _fixed(equation, surface, u0, grid, ts, solver, stop_when, marks, finer) -> Solution:
+    """Fixed steps of a stabilised solver."""
+    start, rules = _start_and_rules(equation, surface, grid[0], u0, solver, stop_when)
+    found = taped.march(start, rules, grid, marks, finer)
+    zero = jnp.zeros_like(found.num_steps)
+    counts = dict(num_steps=found.num_steps, num_accepted_steps=found.num_steps, num_rejected_steps=zero)
+    counts["num_evaluations"] = found.num_evaluations
+    has_ended = cast(Array, found.overflowed | found.stopped)
+    result = diffrax.RESULTS.where(has_ended, diffrax.RESULTS.event_occurred, diffrax.RESULTS.successful)
+    return _as_held(
+        equation, surface, jnp.where(found.is_reached, ts, jnp.inf), found.us, grid[found.num_steps],
+        found.u_end, counts, result, found.overflowed, found.stopped, None, "", True,
+    )  # fmt: skip
+
+
+@eqx.filter_jit
+def _adaptive(equation, surface, u0, t0, t1, ts, solver, adjoint, rtol, atol, max_steps, stop_when) -> Solution:
+    """Adaptive steps of a stabilised solver."""
+    start, rules = _start_and_rules(equation, surface, t0, u0, solver, stop_when)
+
+    def explore(how, start, rules, is_recorded):
+        t0, t1, ts, rtol, atol = how
+        (u0, rate), (solver, bound, largest, condition) = start, rules
+        solver = dataclasses.replace(solver, spectral_bound=lambda t, u, _: bound(t, u))
+        stop = None if condition is None else lambda t, u, _: condition(t, u, rate(t, u))
+        out = _by_diffrax(
+            lambda t, u, _: rate(t, u), None, solver, adjoint, diffrax.NoProgressMeter(), u0, t0, t1,
+            _first_step(bound(t0, u0), t0, t1), ts, _controller(rtol, atol), max_steps, largest, stop, False,
+            is_recorded,
+        )  # fmt: skip
+        times = jnp.concatenate([t0[None], cast(Any, out.ts)[2]]) if is_recorded else None
+        (us, u_end, *_), (ts, t_end, *_) = cast(Any, out.ys), cast(Any, out.ts)
+        return (us, u_end[0], (ts, t_end[0], *_outcome(out))), times
+
+    how = _constant((t0, t1, ts, rtol, atol))
+    us, u_end, (ts, t_end, *outcome) = taped.wander(start, rules, eqx.Partial(explore, how), ts)
+    return _as_held(equation, surface, ts, us, t_end, u_end, *outcome, None, "", False)
+
+
+def _start_and_rules(equation, surface, t0, u0, solver, stop_when) -> tuple[tuple[Array, Any], taped.Rules]:
+    """The state and the rate that a run begins with, and the rest, as functions of the time and the state."""
+    u0 = equation.held(t0, surface, u0)
+
+    def closed(function, *like):
+        # What it closes over becomes a part of it, which derivatives see.
+        return eqx.filter_closure_convert(function, *like)
+
+    # As diffrax has it: broadcast to the state, and in its float type.
+    term = diffrax.ODETerm(_rate)
+    rate = closed(lambda t, u: term.vf(t, u, (equation, surface)), t0, u0)
+    bound = closed(lambda t, u: solver.spectral_bound(t, u, (equation, surface)), t0, u0)
+    condition = None if stop_when is None else closed(_checked(stop_when), t0, u0, u0)
+    return (u0, rate), taped.Rules(*_constant((solver, bound, _largest(surface, u0), condition)))
+
+
+def _checked(stop_when: Condition) -> Condition:
+    def condition(t, u, rate):
+        holds = jnp.asarray(stop_when(t, u, rate))
+        if holds.shape != () or holds.dtype != bool:
+            raise ValueError(
+                f"Expected stop_when to return one truth value, found an array of shape {holds.shape} and type "
+                f"{holds.dtype}. Compare, and take jnp.all or jnp.any."
+            )
+        return holds
+
+    return condition
+
+
+def _constant(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def _largest(surface: Surface, u0: Array) -> Array:
+    """What no state may exceed."""
+    # Products of what is larger are no numbers.
+    largest = jnp.sqrt(jnp.finfo(u0.dtype).max)
+    if isinstance(surface.scheme, Monotone):
+        return largest
+    # Growing modes get there by ever shorter steps: what grew beyond this is on its way.
+    return jnp.minimum(largest, _GROWN * jnp.maximum(1, jnp.max(jnp.abs(u0))))
+
+
+def _as_held(equation: Equation, surface: Surface, ts: Array, us: Array, t_end: Array, u_end: Array, *rest) -> Solution:
+    """The solution with the values that conditions hold: the integrated rate of such a value ends near it only."""
+    us = jax.vmap(lambda t, u: equation.held(t, surface, u))(ts, us)
+    return Solution(ts, us, t_end, equation.held(t_end, surface, u_end), *rest)
+
+
+@eqx.filter_jit
 def _solve(
     equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense
 ) -> Solution:
     u0 = equation.held(t0, surface, u0)
-    # Products of what is larger are no numbers.
-    largest = jnp.sqrt(jnp.finfo(u0.dtype).max)
-    if not isinstance(surface.scheme, Monotone):
-        # Growing modes get there by ever shorter steps: what grew beyond this is on its way.
-        largest = jnp.minimum(largest, _GROWN * jnp.maximum(1, jnp.max(jnp.abs(u0))))
+    largest = _largest(surface, u0)
+
+    def stop(t, u, args):
+        equation, surface = args
+        return _checked(stop_when)(t, u, equation.rate(t, surface, u))
+
+    if grid is not None:
+        controller, dt0 = diffrax.StepTo(ts=grid), None
+        # Of a known number of steps the checkpoints are few.
+        max_steps = min(len(grid) - 1, max_steps) if max_steps is not None else len(grid) - 1
+    else:
+        controller = _controller(rtol, atol)
+        dt0 = _first_step(equation.spectral_bound(t0, surface, u0), t0, t1)
+        if isinstance(solver, ImplicitRungeKutta):  # whose interpolation is linear
+            controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
+    out = _by_diffrax(
+        _rate, (equation, surface), solver, adjoint, meter, u0, t0, t1, dt0, ts, controller, max_steps, largest,
+        None if stop_when is None else stop, dense,
+    )  # fmt: skip
+    (ts, t_end), (us, u_end) = cast(Any, out.ts), cast(Any, out.ys)
+    return _as_held(
+        equation, surface, ts, us, t_end[0], u_end[0], *_outcome(out), out.interpolation, "", grid is not None
+    )
+
+
+def _controller(rtol: Array, atol: Array) -> Any:
+    return Advancing(diffrax.PIDController(rtol=rtol, atol=atol))  # type: ignore
+
+
+def _first_step(bound: Array, t0: Array, t1: Array) -> Array:
+    """A first step that an explicit method takes safely; the controller finds the right one within a few steps."""
+    is_stiff = bound * (t1 - t0) > 1
+    return jnp.where(is_stiff, 1 / jnp.where(is_stiff, bound, 1), t1 - t0)
+
+
+def _by_diffrax(
+    rate, args, solver, adjoint, meter, u0, t0, t1, dt0, ts, controller, max_steps, largest, stop, dense,
+    is_recorded=False,
+) -> diffrax.Solution:  # fmt: skip
+    """The run: its states at ``ts`` and in the end, and when steps ended if that is recorded."""
 
     # Not "is too large": a NaN compares false with everything.
     def has_overflowed(t, y, args, **_):
         del t, args
         return ~(jnp.max(jnp.abs(y)) <= largest)
 
-    def is_to_stop(t, y, args, **_):
-        equation, surface = args
-        return stop_when(t, y, equation.rate(t, surface, y))
-
-    events = {"overflowed": has_overflowed} | ({} if stop_when is None else {"stopped": is_to_stop})
-    if grid is not None:
-        controller, dt0 = diffrax.StepTo(ts=grid), None
-        # Of a known number of steps the checkpoints are few.
-        max_steps = min(len(grid) - 1, max_steps) if max_steps is not None else len(grid) - 1
-    else:
-        controller: Any = Advancing(diffrax.PIDController(rtol=rtol, atol=atol))  # type: ignore
-        bound = equation.spectral_bound(t0, surface, u0)
-        # A first step that an explicit method takes safely; the controller finds the right one within a few steps.
-        is_stiff = bound * (t1 - t0) > 1
-        dt0 = jnp.where(is_stiff, 1 / jnp.where(is_stiff, bound, 1), t1 - t0)
-        if isinstance(solver, ImplicitRungeKutta):  # whose interpolation is linear
-            controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
-    keeps_state = hasattr(solver, "spectral_bound")
-    out = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rate),
+    events = {"overflowed": has_overflowed}
+    if stop is not None:
+        events["stopped"] = lambda t, y, args, **_: stop(t, y, args)
+    kept = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]
+    if is_recorded:
+        kept.append(diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t))
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(rate),
         solver,
         t0,
         t1,
         dt0,
         u0,
-        (equation, surface),
-        saveat=diffrax.SaveAt(
-            subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], solver_state=keeps_state, dense=dense
-        ),
+        args,
+        saveat=diffrax.SaveAt(subs=kept, solver_state=hasattr(solver, "spectral_bound"), dense=dense),
         stepsize_controller=controller,
         adjoint=adjoint,
         event=diffrax.Event(events),
@@ -462,19 +595,16 @@ def _solve(
         throw=False,
         progress_meter=meter,
     )
-    (ts, t_end), (us, u_end) = cast(Any, out.ts), cast(Any, out.ys)
-    # The integrated rate of a held value ends near the value; what is handed out is the value.
-    us = jax.vmap(lambda t, u: equation.held(t, surface, u))(ts, us)
-    u_end = jax.vmap(lambda t, u: equation.held(t, surface, u))(t_end, u_end)
+
+
+def _outcome(out: diffrax.Solution) -> tuple[dict[str, Array], diffrax.RESULTS, Array, Array]:
+    """Counts, result, whether the state overflowed and whether the run was stopped."""
     counts = {name: out.stats[name] for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
-    if keeps_state:
+    if out.solver_state is not None:
         counts["num_evaluations"] = cast(Any, out.solver_state)[1]
     happened = cast(dict[str, Array], out.event_mask)
     stopped = happened.get("stopped", jnp.array(False))
-    overflowed = happened["overflowed"] | (out.result == diffrax.RESULTS.dt_min_reached)
-    return Solution(
-        ts, us, t_end[0], u_end[0], counts, out.result, overflowed, stopped, out.interpolation, "", grid is not None
-    )
+    return counts, out.result, happened["overflowed"] | (out.result == diffrax.RESULTS.dt_min_reached), stopped
 
 
 def _cause_of_overflow(surface: Surface) -> str:

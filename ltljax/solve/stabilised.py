@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -12,17 +12,62 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 # Numbers of stages on offer, about a fifth apart, so at most that much of a step is wasted; odd, as even ones do not
 # damp the stiffest modes.
-_STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
+STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
+
+FEWEST = int(STAGES[0])
 
 
 def bound_of_equation(t, u, args):
     """The spectral bound of the equation that is solved."""
     equation, surface = args
     return equation.spectral_bound(t, surface, u)
+
+
+class Plan(NamedTuple):
+    """The stages of a step. Increments are over the state at its start, and the first is of stage one.
+
+    Attributes:
+        stages: their number.
+        dt: the length of the step.
+        is_stable: whether that is the length asked for.
+        mu: (257 + 1,) of the last increment; entry j belongs to stage j, here and below.
+        nu: of the increment before.
+        mu_rate: of the rate at the last increment, over dt.
+        gamma_rate: of the rate at the start, over dt.
+        c: the time of stage j after the start, over dt.
+    """
+
+    stages: Int[Array, ""]
+    dt: Float[Array, ""]
+    is_stable: Bool[Array, ""]
+    mu: Float[Array, " J"]
+    nu: Float[Array, " J"]
+    mu_rate: Float[Array, " J"]
+    gamma_rate: Float[Array, " J"]
+    c: Float[Array, " J"]
+
+    def first(self, rate0: Array) -> Array:
+        """The first increment."""
+        return self.mu_rate[1] * self.dt * rate0
+
+    def time(self, t0: ArrayLike, j: Array) -> Array:
+        """When the rate is taken from which increment j is made."""
+        # Beyond the last stage, where runs in a batch with longer steps get, within the step.
+        return jnp.asarray(t0) + self.c[jnp.minimum(j, self.stages) - 1] * self.dt
+
+    def stage(self, j: Array, before: Array, last: Array, rate: Array, rate0: Array) -> Array:
+        """Increment j. Made of increments, its rounding is relative to the step, not to the state."""
+        mu, nu, mu_rate, gamma_rate = self.coefficients(j)
+        return mu * last + nu * before + self.dt * (mu_rate * rate + gamma_rate * rate0)
+
+    def coefficients(self, j: Array) -> tuple[Array, Array, Array, Array]:
+        """Those of increment j; beyond the last stage those of an increment like the last."""
+        is_there, row = j <= self.stages, (self.mu[j], self.nu[j], self.mu_rate[j], self.gamma_rate[j])
+        return cast(Any, tuple(jnp.where(is_there, x, rest) for x, rest in zip(row, (1, 0, 0, 0), strict=True)))
 
 
 class Stabilised(diffrax.AbstractAdaptiveSolver):
@@ -51,40 +96,38 @@ class Stabilised(diffrax.AbstractAdaptiveSolver):
         """One step with as many stages as its length needs."""
         del made_jump
         rate0, evaluations = solver_state
-        table = self._coefficients()
-        counts = table["stages"]
-        table = {name: jnp.asarray(values, y0.dtype) for name, values in table.items()}
-        bound = self.spectral_bound(t0, y0, args)
+        plan = self.plan(self.spectral_bound(t0, y0, args), t1 - t0)
+
+        def stage(carry):
+            j, before, last = carry
+            rate = terms.vf(plan.time(t0, j), y0 + last, args)
+            return j + 1, last, plan.stage(j, before, last, rate, rate0)
+
+        start = (jnp.full((), 2, plan.stages.dtype), jnp.zeros_like(y0), plan.first(rate0))
+        _, _, increment = eqxi.while_loop(
+            lambda carry: carry[0] <= plan.stages, stage, start, max_steps=int(STAGES[-1]), kind=self.loop_kind
+        )
+        y1 = y0 + increment
+        rate1 = terms.vf(t1, y1, args)
+        error = self._error(increment, plan.dt, rate0, rate1)
+        y1, error = jnp.where(plan.is_stable, y1, jnp.nan), jnp.where(plan.is_stable, error, jnp.inf)
+        dense = dict(y0=y0, y1=y1, k0=plan.dt * rate0, k1=plan.dt * rate1)
+        state = (rate1, evaluations + plan.stages.astype(evaluations.dtype))
+        return y1, error, dense, state, diffrax.RESULTS.successful
+
+    def plan(self, bound: Float[Array, ""], length: ArrayLike) -> Plan:
+        """The stages of a step of some length where eigenvalues are within a bound."""
+        length = jnp.asarray(length)
+        table = {name: jnp.asarray(values, length.dtype) for name, values in self._coefficients().items()}
         reach = table["reach"]
         # Beyond the largest number of stages a step would be unstable: an adaptive controller refuses it, and without
         # one the run stops at what is not a number. Its stages are those of the longest stable step: if they
         # overflowed, so would derivatives, whatever is made of their values.
-        is_stable = (t1 - t0) * bound <= reach[-1]
-        dt = jnp.where(is_stable, t1 - t0, jax.lax.stop_gradient(reach[-1] / jnp.maximum(bound, 1e-30)))
-        stiffness = dt * bound
-        choice = jnp.minimum(jnp.searchsorted(reach, stiffness), len(counts) - 1)
-        stages = jnp.asarray(counts)[choice]
-        mu, nu, mu_rate, gamma_rate, c = (table[name][choice] for name in ("mu", "nu", "mu_rate", "gamma_rate", "c"))
-
-        # Written for the increments over y0: their rounding is relative to the step, not to the state.
-        def stage(carry):
-            j, before, last = carry
-            rate = terms.vf(t0 + c[j - 1] * dt, y0 + last, args)
-            new = mu[j] * last + nu[j] * before + dt * (mu_rate[j] * rate + gamma_rate[j] * rate0)
-            return j + 1, last, new
-
-        first = mu_rate[1] * dt * rate0
-        start = (jnp.full((), 2, stages.dtype), jnp.zeros_like(y0), first)
-        _, _, increment = eqxi.while_loop(
-            lambda carry: carry[0] <= stages, stage, start, max_steps=int(counts[-1]), kind=self.loop_kind
-        )
-        y1 = y0 + increment
-        rate1 = terms.vf(t1, y1, args)
-        error = self._error(increment, dt, rate0, rate1)
-        y1, error = jnp.where(is_stable, y1, jnp.nan), jnp.where(is_stable, error, jnp.inf)
-        dense = dict(y0=y0, y1=y1, k0=dt * rate0, k1=dt * rate1)
-        state = (rate1, evaluations + stages.astype(evaluations.dtype))
-        return y1, error, dense, state, diffrax.RESULTS.successful
+        is_stable = length * bound <= reach[-1]
+        dt = jnp.where(is_stable, length, jax.lax.stop_gradient(reach[-1] / jnp.maximum(bound, 1e-30)))
+        choice = jnp.minimum(jnp.searchsorted(reach, dt * bound), len(STAGES) - 1)
+        rows = {name: table[name][choice] for name in ("mu", "nu", "mu_rate", "gamma_rate", "c")}
+        return Plan(jnp.asarray(STAGES)[choice], dt, is_stable, **rows)
 
     def longest_step(self, bound: float) -> float:
         """The longest stable step where eigenvalues are within a bound."""
@@ -132,7 +175,7 @@ class RKL2(Stabilised):
     @staticmethod
     @functools.cache
     def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        s, j = _STAGES[:, None], _stage_numbers()
+        s, j = STAGES[:, None], _stage_numbers()
         b = np.where(j < 2, 1 / 3, (j**2 + j - 2) / (2 * j * (j + 1)))
         c = (j**2 + j - 2) / (s**2 + s - 2)
         c[:, 1] = c[:, 2] / 3
@@ -170,7 +213,7 @@ class RKL1(Stabilised):
     @staticmethod
     @functools.cache
     def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        s, j = _STAGES[:, None], _stage_numbers()
+        s, j = STAGES[:, None], _stage_numbers()
         return _legendre(np.ones(j.shape), 2 / (s**2 + s), (j**2 + j) / (s**2 + s))
 
     def _error(self, increment, dt, rate0, rate1):
@@ -179,7 +222,7 @@ class RKL1(Stabilised):
 
 def _stage_numbers() -> np.ndarray:
     # Entry 0 is of no stage; the one in its place keeps the formulas finite.
-    return np.maximum(np.arange(_STAGES[-1] + 1), 1).astype(float)
+    return np.maximum(np.arange(STAGES[-1] + 1), 1).astype(float)
 
 
 def _legendre(b: np.ndarray, scale: np.ndarray, c: np.ndarray) -> dict[str, np.ndarray]:
@@ -191,4 +234,4 @@ def _legendre(b: np.ndarray, scale: np.ndarray, c: np.ndarray) -> dict[str, np.n
     mu_rate[:, 1:2] = b[1] * scale
     table = dict(mu=mu, nu=nu, mu_rate=mu_rate, gamma_rate=(last - 1) * mu_rate, c=c)
     table = {name: np.broadcast_to(values, mu_rate.shape) for name, values in table.items()}
-    return table | dict(reach=2 / scale[:, 0], stages=_STAGES)
+    return table | dict(reach=2 / scale[:, 0])
