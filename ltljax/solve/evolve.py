@@ -553,6 +553,7 @@ def _solve(
 
 
 def _controller(rtol: Array, atol: Array) -> Any:
+    # The type checker does not see that the arguments left out have defaults.
     return Advancing(diffrax.PIDController(rtol=rtol, atol=atol))  # type: ignore
 
 

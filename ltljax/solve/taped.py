@@ -112,17 +112,20 @@ def marks_of(grid: np.ndarray, ts: np.ndarray, spacing: int) -> Marks:
 
 def is_worth_it(count: int | None, u0: AnyArray) -> bool:
     """Whether so many fixed steps (None: adaptive ones) have a tape of use: what fits is retraced seldom enough."""
-    return count is None or 36 * count <= _RETRACED * _states(math.ceil(_KEPT * math.sqrt(count)), u0, 1) ** 2
+    return count is None or 36 * count <= _RETRACED * _kept_of_fixed(count, u0) ** 2
 
 
 def spacing_of(count: int, u0: AnyArray) -> int:
     """Of how many of so many fixed steps one has its state kept for the way back."""
-    return -(-count // _states(math.ceil(_KEPT * math.sqrt(count)), u0, 1))
+    return -(-count // _kept_of_fixed(count, u0))
 
 
-def _states(wanted: int, u0: AnyArray, least: int) -> int:
-    affordable = max(_SHORTEST, _BYTES // max(u0.nbytes, 1))
-    return max(least, min(wanted, affordable))
+def _kept_of_fixed(count: int, u0: AnyArray) -> int:
+    return _affordable(math.ceil(_KEPT * math.sqrt(count)), u0)
+
+
+def _affordable(wanted: int, u0: AnyArray) -> int:
+    return min(wanted, max(_SHORTEST, _BYTES // max(u0.nbytes, 1)))
 
 
 @eqx.filter_custom_vjp
@@ -154,7 +157,7 @@ def _(residuals, cotangents, perturbed, start, rules, times, marks, finer):
     starts, u0, count = _starts(finer), start[0], len(times) - 1
     step = starts[finer.kept] - 1
     back = _Back(rules, times, starts, states, taken, Rows(step, jnp.ones(step.shape, times.dtype)))
-    longest, size = spacing_of(count, u0), _states(math.ceil(_KEPT * math.sqrt(count)), u0, _SHORTEST)
+    longest, size = spacing_of(count, u0), max(_SHORTEST, _kept_of_fixed(count, u0))
     ct = jnp.zeros_like(u0) if cotangents.u_end is None else cotangents.u_end
     return _backward(back, start[1], perturbed, ct, cotangents.us, None, longest, size)
 
@@ -188,7 +191,7 @@ def _(residuals, cotangents, perturbed, start, rules, explore, ts):
     u0, taken = start[0], jnp.sum(jnp.isfinite(times)) - 1
     # Beyond the last step of a run in a batch there are steps of no length.
     times = jnp.where(jnp.isfinite(times), times, times[taken])
-    size = _states(_KEPT_OF_ADAPTIVE, u0, 1)
+    size = _affordable(_KEPT_OF_ADAPTIVE, u0)
     longest = -(-(len(times) - 1) // size)
     # The steps of the longest run, between as many marks as there are or fewer.
     last = eqxi.unvmap_max(taken)
