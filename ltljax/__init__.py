@@ -11,6 +11,8 @@ equations are made of operators; `solve` carries them through time.
 from importlib.metadata import version as _version
 
 from . import imaging
+from .construction import InconsistentRowsWarning
+from .curvature import Curvature, PolyhedralCurvature, curvature, polyhedral_curvature
 from .elliptic import EllipticStencil, direction_tensor, elliptic_stencil
 from .equations import (
     CahnHilliard,
@@ -48,8 +50,6 @@ from .fit import (
 from .lifting.schemes import Monotone, Paper, Polynomial
 from .mesh import Mesh, MeshError, load_mesh, shapes
 from .operators import (
-    Curvature,
-    curvature,
     divergence,
     gradient,
     growth_rate,
@@ -97,7 +97,7 @@ from .solve import (
     steady_state,
     transport_vectors,
 )
-from .surface import InconsistentRowsWarning, Surface
+from .surface import Surface
 from .vectors import (
     Connection,
     connection,
@@ -158,6 +158,7 @@ __all__ = [
     "Observations",
     "Paper",
     "PatternStatistics",
+    "PolyhedralCurvature",
     "Polynomial",
     "Positive",
     "ReactionDiffusion",
@@ -209,6 +210,7 @@ __all__ = [
     "plot",
     "plot_dispersion",
     "poisson",
+    "polyhedral_curvature",
     "rotated",
     "rotated_gradient",
     "screened_poisson",

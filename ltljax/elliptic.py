@@ -11,11 +11,13 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
+from .construction import charts_of, reach_along
 from .lifting import support
+from .lifting.intrinsic import Paths
 from .lifting.jets import operator_weights
-from .lifting.ring import Lift, lifted_ring
-from .lifting.schemes import PerBlock, offsets
-from .mesh import k_ring, one_rings
+from .lifting.layout import PerBlock, Places, block_paths, rows_last
+from .lifting.schemes import Topology, places
+from .mesh import one_rings
 from .progress import watched
 from .surface import Surface
 from .tables import (
@@ -39,19 +41,19 @@ class EllipticStencil(eqx.Module):
 
     Attributes:
         table: the neighbours.
+        paths: for each block the half-edges that lead to them; None where all rows are laid out in space.
         weights: one array (K, N) per block of the table, non-negative.
         reverse: the same weights in the order of the table's reverse, for derivatives in reverse mode.
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
         mean_diffusion: half the trace of D in the tangent plane, its mean over the vertices.
-        lift: how neighbours are laid into the tangent planes.
     """
 
     table: Table
+    paths: tuple[Paths, ...] | None
     weights: PerBlock
     reverse: ReverseWeights | None
     residual: Float[AnyArray, " V"]
     mean_diffusion: Float[AnyArray, ""]
-    lift: Lift = eqx.field(static=True)
 
     def __call__(self, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
         """The operator applied to u."""
@@ -73,11 +75,11 @@ class EllipticStencil(eqx.Module):
         As good as the neighbours suit the new coefficients; ``residual`` tells.
         """
         targets = _targets(surface.geometry.frames, diffusion, drift)
-        frames, kinds = surface.geometry.frames, surface.topology.kinds
-        weights, residual = _rows(surface.vertices, frames, kinds, targets, self.table, self.lift)
+        around = places(surface.scheme, surface.geometry)
+        weights, residual = _rows(around, surface.topology.kinds, targets, self.table, self.paths)
         found = (weights, reverse_weights(self.table, weights), residual, _mean_diffusion(targets))
         weights, reverse, residual, mean = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, weights, reverse, residual, mean, self.lift)
+        return EllipticStencil(self.table, self.paths, weights, reverse, residual, mean)
 
 
 def elliptic_stencil(
@@ -111,15 +113,18 @@ def elliptic_stencil(
             "The neighbours of a stencil are chosen on the host, but the surface is being traced by a JAX "
             "transformation. Build the stencil outside, and use its `with_coefficients` inside."
         )
-    vertices, frames, kinds = (
-        np.asarray(a, a.dtype if a.dtype.kind == "i" else np.float64)
-        for a in jax.device_get((surface.vertices, surface.geometry.frames, surface.topology.kinds))
+    topology, geometry = jax.tree.map(_on_host, (surface.topology, surface.geometry))
+    around, kinds = places(surface.scheme, geometry), topology.kinds
+    drift = None if drift is None else np.asarray(drift, np.float64)
+    targets = _targets(geometry.frames, _checked(diffusion, geometry.frames), drift)
+    reach = reach_along(
+        one_rings(topology.faces, surface.num_vertices),
+        around,
+        charts_of(surface.scheme, topology, around),
+        topology.is_extrinsic,
     )
-    targets = _targets(frames, _checked(diffusion, frames), None if drift is None else np.asarray(drift, np.float64))
-    lift: Lift = "projection" if surface.scheme.lift == "projection" else "chord"
-    rings = one_rings(np.asarray(surface.faces), surface.num_vertices)
-    rows = (rings.offsets, rings.neighbours)
-    _, residual = _rows(vertices, frames, kinds, targets, build_table(*rows), lift)
+    rows = support.Rows.all_of(reach(np.arange(surface.num_vertices), 1))
+    _, residual = _rows(around, kinds, targets, *_table(rows, topology, around))
     # Where some row meets every condition there is nothing to emphasise.
     for emphasis in (1.0, _EMPHASIS):
         rows, record = support.nonnegative_support(
@@ -127,17 +132,18 @@ def elliptic_stencil(
             residual <= support.CONSISTENT,
             kinds,
             targets[0],
-            lambda which, k: k_ring(rings, surface.num_vertices, which, k),
-            support.lift_onto(vertices, frames, lift),
+            reach,
             watched("choosing the neighbours of the stencil", progress=progress),
             emphasis,
         )
         residual = record.residual
-    table = reversible(build_table(*rows))
-    weights, residual = _rows(vertices, frames, kinds, targets, table, lift)
+    table, paths = _table(rows, topology, around)
+    table = reversible(table)
+    weights, residual = _rows(around, kinds, targets, table, paths)
     found = (weights, reverse_weights(table, weights), residual, _mean_diffusion(targets))
     weights, reverse, residual, mean = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
-    return EllipticStencil(jax.tree.map(jnp.asarray, table), weights, reverse, residual, mean, lift)
+    table, paths = jax.tree.map(jnp.asarray, (table, paths))
+    return EllipticStencil(table, paths, weights, reverse, residual, mean)
 
 
 def direction_tensor(
@@ -211,14 +217,31 @@ def _mean_diffusion(targets: AnyArray) -> AnyArray:
     return targets.__array_namespace__().asarray((targets[0, 3] + targets[0, 4]).mean() / 4)
 
 
-def _rows(vertices, frames, kinds, targets, table: Table, lift: Lift) -> tuple[PerBlock, AnyArray]:
+def _on_host(leaf: AnyArray) -> np.ndarray:
+    """The array in NumPy, numbers in float64."""
+    array = np.asarray(leaf)
+    return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+
+def _table(rows: support.Rows, topology: Topology, around: Places) -> tuple[Table, tuple[Paths, ...] | None]:
+    """The table of rows, and their paths where rows are laid out in charts (host)."""
+    table = build_table(rows.offsets, rows.members)
+    if around.directions is None:
+        return table, None
+    none = around.directions.no_half_edge
+    return table, block_paths(table, rows.offsets, rows.paths, none, topology.is_extrinsic)
+
+
+def _rows(
+    around: Places, kinds: AnyArray, targets: AnyArray, table: Table, paths: tuple[Paths, ...] | None
+) -> tuple[PerBlock, AnyArray]:
     """The weights on the neighbours, and the residual of every row."""
 
-    def rows(block):
-        lifted = lifted_ring(offsets(vertices, block), block.centre(frames), lift)
+    def rows(block, lifted):
+        lifted = lifted.__array_namespace__().moveaxis(lifted, -1, 1)
         wanted = block.centre(targets[0].T).T[None]
         c, residual = operator_weights(lifted, block.centre(kinds), wanted, nonnegative=True, emphasis=_EMPHASIS)
         return c[0], residual[0]
 
-    weights, residuals = zip(*table.each(rows), strict=True)
+    weights, residuals = zip(*table.each(rows, rows_last(around.lifted(table, paths))), strict=True)
     return weights, table.rows_from(list(residuals))

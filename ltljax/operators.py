@@ -171,58 +171,10 @@ def hessian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 
         ValueError: `Paper` has no second derivatives of its own.
     """
     _check_rows(surface, u, "u")
-    xx, xy, yy = _second_derivatives(surface, u)
+    xx, xy, yy = second_derivatives(surface, u)
     components = jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
     frames = surface.geometry.frames
     return jnp.einsum("abv...,vac,vbd->v...cd", components, frames, frames)
-
-
-class Curvature(eqx.Module):
-    """How a surface bends. Positive where it bends away from the normal: a sphere of radius R has 1 / R.
-
-    Attributes:
-        shape_operator: (V, 3, 3) the derivative of the normal, symmetric and tangent, in ambient coordinates.
-        mean: (V,) H, half its trace.
-        gauss: (V,) K, its determinant in the tangent plane.
-        principal: (V, 2) its eigenvalues, the larger first.
-        directions: (V, 2, 3) the unit tangent vectors they belong to.
-    """
-
-    shape_operator: Float[Array, "V 3 3"]
-    mean: Float[Array, " V"]
-    gauss: Float[Array, " V"]
-    principal: Float[Array, "V 2"]
-    directions: Float[Array, "V 2 3"]
-
-
-@eqx.filter_jit
-def curvature(surface: Surface) -> Curvature:
-    """The curvature of a surface, from the second derivatives of its height over each tangent plane.
-
-    First order on irregular meshes for ``Monotone``, one less than its degree for ``Polynomial``; differentiable in
-    the vertices, but for the principal directions where both curvatures are equal.
-
-    Raises:
-        ValueError: `Paper` has no second derivatives of its own.
-    """
-    frames, normals = surface.geometry.frames, surface.normals
-    xx, xy, yy = (-jnp.sum(part * normals, axis=-1) for part in _second_derivatives(surface, surface.vertices))
-    mean, gauss = (xx + yy) / 2, xx * yy - xy**2
-    half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
-    # Where both curvatures are equal the root has no derivative and the angle no value: any will do.
-    is_umbilic = squared == 0
-    root = jnp.where(is_umbilic, 0, jnp.sqrt(jnp.where(is_umbilic, 1, squared)))
-    angle = jnp.arctan2(jnp.where(is_umbilic, 0, xy), jnp.where(is_umbilic, 1, half)) / 2
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    turned = jnp.stack([jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)], axis=1)
-    components = jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
-    return Curvature(
-        shape_operator=jnp.einsum("abv,vac,vbd->vcd", components, frames, frames),
-        mean=mean,
-        gauss=gauss,
-        principal=jnp.stack([mean + root, mean - root], axis=-1),
-        directions=jnp.einsum("vpa,vac->vpc", turned, frames),
-    )
 
 
 @eqx.filter_jit
@@ -310,7 +262,8 @@ def _gradient_in_frame(surface: Surface, u: Array) -> tuple[Array, Array]:
     return difference_sum(table, along_e1, u), difference_sum(table, along_e2, u)
 
 
-def _second_derivatives(surface: Surface, u: Array) -> tuple[Array, Array, Array]:
+def second_derivatives(surface: Surface, u: Array) -> tuple[Array, Array, Array]:
+    """The second derivatives xx, xy and yy of u in the frames of the vertices."""
     weights = surface.geometry.hessian_weights
     if weights is None:
         raise ValueError("Paper() has no second derivatives of its own. Use ltl.Monotone() or ltl.Polynomial().")

@@ -14,9 +14,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from .curvature import curvature, polyhedral_curvature
 from .lifting.frames import transport
-from .lifting.schemes import PerBlock
-from .operators import curvature, divergence, gradient, laplacian
+from .lifting.intrinsic import Paths
+from .lifting.layout import PerBlock
+from .lifting.schemes import places
+from .operators import divergence, gradient, laplacian
 from .surface import Surface
 from .tables import AnyArray, ReverseWeights, Table, difference_sum, reverse_weights, slot_sum
 
@@ -64,8 +67,7 @@ def connection(surface: Surface, symmetry: int = 1) -> Connection:
         raise ValueError("Paper() has no vector Laplacian. Use ltl.Monotone() or ltl.Polynomial().")
     if symmetry < 1:
         raise ValueError(f"Expected a symmetry of 1 or more, found {symmetry}.")
-    turns = _turns(surface, table)
-    turns = tuple(power(turn, symmetry) for turn in turns)
+    turns = tuple(power(turn, symmetry) for turn in _turns(surface, table, surface.topology.diffusion_paths))
     x, y = (tuple(w * turn[..., i] for w, turn in zip(weights, turns, strict=True)) for i in (0, 1))
     centre = jnp.stack([slot_sum(table, x) - slot_sum(table, weights), slot_sum(table, y)])
     return Connection(table, (x, y), centre, (reverse_weights(table, x), reverse_weights(table, y)))
@@ -139,7 +141,7 @@ def covariant_derivative(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Floa
     """
     z = to_frame(surface, X)
     table, frames = surface.topology.jet, surface.geometry.frames
-    turns = _turns(surface, table)
+    turns = _turns(surface, table, surface.topology.jet_paths)
 
     def along(weights):
         x, y = (tuple(w * turn[..., i] for w, turn in zip(weights, turns, strict=True)) for i in (0, 1))
@@ -181,7 +183,8 @@ def vector_laplacian(
 def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """grad div X + n x grad curl X, the Laplacian that takes the gradient of u to that of Delta u; sign as `laplacian`.
 
-    By Weitzenboeck's formula the vector Laplacian less K X, K the Gauss curvature. Pointwise first order.
+    By Weitzenboeck's formula the vector Laplacian less K X, K the Gauss curvature: the fitted one, but beside a crease
+    the angle defect over the vertex area. Pointwise first order.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -189,7 +192,10 @@ def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Arr
 
     Source: Petersen (2016), Riemannian Geometry, doi:10.1007/978-3-319-26654-1, section 9.3.
     """
-    return vector_laplacian(surface, X) - _beside(curvature(surface).gauss, X) * tangential(surface, X)
+    gauss, is_creased = curvature(surface).gauss, surface.topology.is_creased
+    if is_creased is not None:
+        gauss = jnp.where(is_creased, polyhedral_curvature(surface).gauss, gauss)
+    return vector_laplacian(surface, X) - _beside(gauss, X) * tangential(surface, X)
 
 
 @eqx.filter_jit
@@ -357,15 +363,9 @@ def _turn(normal: AnyArray, frame: AnyArray, from_normal: AnyArray, from_frame: 
     return jnp.einsum("...ac,...c->...a", frame, moved)
 
 
-def _turns(surface: Surface, table: Table) -> tuple[Array, ...]:
+def _turns(surface: Surface, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
     """For every slot the turn (K, N, 2) from the neighbour's frame to the vertex's."""
-    normals, frames = surface.normals, surface.geometry.frames
-
-    def turns(block):
-        here, frame = block.centre(normals)[None], block.centre(frames)[None]
-        return _turn(here, frame, block.neighbours(normals), block.neighbours(frames))
-
-    return tuple(table.each(turns))
+    return places(surface.scheme, surface.geometry).turns(table, paths)
 
 
 def power(z: Float[AnyArray, "*N 2"], exponent: int) -> Float[Array, "*N 2"]:

@@ -11,11 +11,44 @@ import pytest
 import ltljax as ltl
 from ltljax.lifting.schemes import weigh_in_frames
 
+
+def jittered_ellipsoid(axes, amount, seed):
+    sphere = ltl.shapes.jittered_sphere(2, amount, seed)
+    return ltl.Mesh(sphere.vertices * np.array(axes), sphere.faces)
+
+
+def jittered_disk(amount, seed):
+    # In z = 0 the divergence of `vector_field` would be zero, so the disk is tilted.
+    disk = ltl.shapes.jittered(ltl.shapes.disk(rings=8), amount, seed)
+    x, y, _ = disk.vertices.T
+    return ltl.Mesh(np.stack([x, 0.8 * y, 0.6 * y], axis=1), disk.faces)
+
+
+def jittered_hemisphere(amount, seed):
+    def onto_sphere(points):
+        return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+    return ltl.shapes.jittered(ltl.shapes.hemisphere(rings=8), amount, seed, onto_sphere)
+
+
+def jittered_saddle(amount, seed):
+    square = ltl.shapes.jittered(ltl.shapes.square(2.0, n=12), amount, seed)
+    x, y, _ = (square.vertices - np.array([1.0, 1.0, 0.0])).T
+    return ltl.Mesh(np.stack([x, y, (x**2 - y**2) / 2 + x * y / 3], axis=1), square.faces)
+
+
 SHAPES = {
     "icosphere": lambda: ltl.shapes.icosphere(2),
     "jittered sphere": lambda: ltl.shapes.jittered_sphere(2, 0.5, seed=1),
+    "strongly jittered sphere": lambda: ltl.shapes.jittered_sphere(2, 0.8, seed=2),
     "random sphere": lambda: ltl.shapes.random_sphere(162, seed=1),
+    "larger random sphere": lambda: ltl.shapes.random_sphere(300, seed=2),
+    "jittered ellipsoid": lambda: jittered_ellipsoid((2.0, 1.5, 1.0), 0.5, seed=3),
     "jittered torus": lambda: ltl.shapes.jittered_torus(24, 12, 0.3, seed=1),
+    "strongly jittered thin torus": lambda: ltl.shapes.jittered_torus(30, 10, 0.4, seed=2, major=2.0, minor=0.6),
+    "jittered disk": lambda: jittered_disk(0.2, seed=4),
+    "jittered hemisphere": lambda: jittered_hemisphere(0.2, seed=5),
+    "jittered saddle": lambda: jittered_saddle(0.25, seed=6),
 }
 REAL = ["spot_low.obj", "spot.obj", "hand_open.obj"]
 SAMPLES = 300
@@ -56,12 +89,15 @@ def test_operators_equal_the_papers_formulas(name, real_mesh):
     u, X = field(mesh), vector_field(mesh)
     arguments = dict(vertices=mesh.vertices, faces=mesh.faces, at=at)
     gradients = paper_reference.gradients(u=u, **arguments)[at]
-    assert relative_difference(ltl.gradient(surface, u)[at], gradients) < 1e-12
-    # X is not tangent: its normal part has no divergence in either.
+    # X is not tangent. Its normal part has no divergence in the package or in the transcription.
     divergences = paper_reference.divergences(X=X, **arguments)[at]
-    assert relative_difference(ltl.divergence(surface, X)[at], divergences) < 1e-12
     laplacians = paper_reference.laplacians(u=u, **arguments)[at]
-    assert relative_difference(ltl.laplacian(surface, u)[at], laplacians) < 1e-12
+    differences = {
+        "gradient": relative_difference(ltl.gradient(surface, u)[at], gradients),
+        "divergence": relative_difference(ltl.divergence(surface, X)[at], divergences),
+        "laplacian": relative_difference(ltl.laplacian(surface, u)[at], laplacians),
+    }
+    assert all(difference < 1e-12 for difference in differences.values()), differences
 
 
 @pytest.mark.parametrize("name", ["jittered torus", "hand_open.obj"])
@@ -78,14 +114,19 @@ def with_turned_frames(surface, angles):
     e1, e2 = np.moveaxis(geometry.frames, 1, 0)
     cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
     frames = np.stack([cosine * e1 + sine * e2, cosine * e2 - sine * e1], axis=1)
+    directions = geometry.directions
+    if directions is not None:
+        # A chart turns with its frame.
+        turned = directions.angles - np.append(angles[topology.triangulation.tails], [0, 0])
+        directions = dataclasses.replace(directions, angles=turned)
     geometry = weigh_in_frames(
-        surface.scheme, geometry.vertices, topology, geometry.normals, frames, geometry.conormals
+        surface.scheme, geometry.vertices, topology, geometry.normals, frames, geometry.conormals, directions
     )
     return dataclasses.replace(surface, geometry=jax.tree.map(jnp.asarray, geometry))
 
 
 @pytest.mark.parametrize("name", ["jittered sphere", "jittered torus"])
-@pytest.mark.parametrize("scheme", [ltl.Paper(), ltl.Monotone()])
+@pytest.mark.parametrize("scheme", [ltl.Paper(), ltl.Monotone(), ltl.Monotone(lift="chord")])
 def test_no_operator_depends_on_the_tangent_bases(name, scheme):
     mesh = SHAPES[name]()
     surface = ltl.Surface.from_mesh(mesh, scheme)
@@ -103,6 +144,70 @@ def test_the_transcription_does_not_depend_on_the_tangent_bases():
     for formula in (paper_reference.gradients, paper_reference.laplacians):
         turned, straight = (formula(mesh.vertices, mesh.faces, field(mesh), a) for a in (angles, None))
         assert relative_difference(turned, straight) < 1e-12
+
+
+def directed_edges(mesh):
+    """Normals (V, 3) by the paper's formula, and all edges as pairs (i, v), in both directions."""
+    pairs = paper_reference.faces_at(mesh.faces, mesh.num_vertices)
+    normals = np.array([paper_reference.normal(mesh.vertices, v, pairs[v]) for v in range(mesh.num_vertices)])
+    return normals, [(i, v) for v in range(mesh.num_vertices) for i in sorted({i for pair in pairs[v] for i in pair})]
+
+
+def shortest_rotation(normal_from, normal_to, X):
+    """X rotated about normal_from x normal_to by the angle between the two normals."""
+    # Rodrigues' formula, with axis = sin(angle) times the unit axis.
+    axis, cosine = np.cross(normal_from, normal_to), normal_from @ normal_to
+    return cosine * X + np.cross(axis, X) + (axis @ X) * axis / (1 + cosine)
+
+
+def direction_in_plane(edge, n):
+    projection = edge - (edge @ n) * n
+    return projection / np.linalg.norm(projection)
+
+
+TRANSPORTED = ["jittered sphere", "jittered ellipsoid", "jittered torus", "jittered saddle"]
+
+
+@pytest.mark.parametrize("name", TRANSPORTED)
+def test_the_papers_transport_is_an_isometry_of_tangent_planes_that_keeps_the_edge(name):
+    mesh = SHAPES[name]()
+    normals, edges = directed_edges(mesh)
+    for i, v in edges:
+        edge = mesh.vertices[i] - mesh.vertices[v]
+        images = np.array(
+            [paper_reference.transport(edge, normals[i], normals[v], e) for e in paper_reference.basis(normals[i])]
+        )
+        np.testing.assert_allclose(images @ images.T, np.eye(2), atol=1e-14)
+        np.testing.assert_allclose(np.cross(*images), normals[v], atol=1e-14)
+        edge_image = paper_reference.transport(edge, normals[i], normals[v], direction_in_plane(edge, normals[i]))
+        np.testing.assert_allclose(edge_image, direction_in_plane(edge, normals[v]), atol=1e-14)
+        normal_image = paper_reference.transport(edge, normals[i], normals[v], normals[i])
+        np.testing.assert_allclose(normal_image, 0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", TRANSPORTED)
+def test_the_papers_transport_differs_from_the_shortest_rotation(name):
+    mesh = SHAPES[name]()
+    normals, edges = directed_edges(mesh)
+    differences = []
+    for i, v in edges:
+        X = paper_reference.basis(normals[i])[0]
+        transported = paper_reference.transport(mesh.vertices[i] - mesh.vertices[v], normals[i], normals[v], X)
+        rotated = shortest_rotation(normals[i], normals[v], X)
+        assert abs(rotated @ normals[v]) < 1e-14
+        assert abs(np.linalg.norm(rotated) - 1) < 1e-14
+        differences.append(np.linalg.norm(transported - rotated))
+    assert np.max(differences) > 1e-3
+
+
+def test_the_papers_transport_is_the_shortest_rotation_for_the_exact_normals_of_a_sphere():
+    # There every edge lies in the plane that the normals at its ends span.
+    mesh = SHAPES["jittered sphere"]()
+    for i, v in directed_edges(mesh)[1]:
+        normal_from, normal_to = mesh.vertices[i], mesh.vertices[v]
+        X = paper_reference.basis(normal_from)[0]
+        transported = paper_reference.transport(normal_from - normal_to, normal_from, normal_to, X)
+        np.testing.assert_allclose(transported, shortest_rotation(normal_from, normal_to, X), atol=1e-14)
 
 
 PUBLISHED = {2: (1.43e-1, 4.66e-2), 3: (3.91e-2, 1.21e-2), 4: (1.14e-2, 3.16e-3), 5: (4.78e-3, 8.45e-4)}

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..operators import curvature, gradient, hessian
+from ..curvature import curvature
+from ..operators import gradient, hessian
 from ..surface import Surface
 from ..tables import AnyArray
 from .signals import number

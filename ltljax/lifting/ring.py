@@ -90,6 +90,35 @@ def inverted_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) 
     return normals * xp.where(xp.sum(normals * area, axis=-1, keepdims=True) < 0, -1, 1).astype(normals.dtype)
 
 
+def angle_weighted_normals(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) -> Float[AnyArray, "N 3"]:
+    """Unit normals: face normals averaged with the angles of the faces at the vertex. First order on smooth surfaces.
+
+    They do not depend on how the faces are cut into triangles: on a crease between two flat sides the normal halves the
+    angle between theirs.
+
+    Source: Thurmer and Wuthrich (1998), Computing vertex normals from polygonal facets,
+    doi:10.1080/10867651.1998.10487487.
+    """
+    xp = offsets.__array_namespace__()
+    following = take_slots(offsets, topology.following(offsets.shape[0]))
+    face_normals = xp.cross(offsets, following)
+    squared = xp.sum(face_normals**2, axis=-1)
+    has_face = squared > 0
+    sine = xp.sqrt(xp.where(has_face, squared, 1))
+    angle = xp.arctan2(sine, xp.sum(offsets * following, axis=-1))
+    return unit(xp.sum(xp.where(has_face, angle / sine, 0)[..., None] * face_normals, axis=0))
+
+
+def angle_sums(offsets: Float[AnyArray, "K N 3"], topology: RingTopology) -> Float[AnyArray, " N"]:
+    """The sum of the angles of the faces at each vertex, in radians."""
+    xp = offsets.__array_namespace__()
+    following = take_slots(offsets, topology.following(offsets.shape[0]))
+    squared = xp.sum(xp.cross(offsets, following) ** 2, axis=-1)
+    has_face = squared > 0
+    angle = xp.arctan2(xp.sqrt(xp.where(has_face, squared, 1)), xp.sum(offsets * following, axis=-1))
+    return xp.sum(xp.where(has_face, angle, 0), axis=0)
+
+
 def lifted_ring(
     offsets: Float[AnyArray, "K N 3"], frames: Float[AnyArray, "N 2 3"], lift: Lift
 ) -> Float[AnyArray, "K N 2"]:

@@ -4,15 +4,25 @@ What enters: positions and `Topology`. What leaves: `Geometry`, a record of ever
 """
 
 import dataclasses
-from typing import ClassVar, cast
+from typing import ClassVar, Literal
 
 import equinox as eqx
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from ..tables import AnyArray, Block, ReverseWeights, Table, reverse_weights, slot_sum
-from . import jets, paper
-from .frames import boundary_frames, corner_conormals, tangent_frames, transport
-from .ring import Lift, RingTopology, centroid_normals, inverted_normals, last_slot, lifted_ring, take_slots
+from ..tables import AnyArray, ReverseWeights, Table, reverse_weights, slot_sum
+from . import intrinsic, jets, paper
+from .frames import boundary_frames, corner_conormals, tangent_frames
+from .intrinsic import CotangentRows, Directions, Paths, RingAngles, Triangulation
+from .layout import PerBlock, Places, offsets, rows_last
+from .ring import (
+    Lift,
+    RingTopology,
+    angle_weighted_normals,
+    centroid_normals,
+    inverted_normals,
+    last_slot,
+    take_slots,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,22 +41,24 @@ class Paper:
 class Monotone:
     """The default: the quadratic fit on the lifted ring, on supports that keep every Laplacian weight non-negative.
 
-    The same two steps as the paper (lift the ring to the tangent plane, differentiate scattered data there), with
-    refined normals. Non-negative weights give diffusion a maximum principle and its matrix no eigenvalue with
-    positive real part. Solutions are second order in the mesh size; the pointwise Laplacian is first order on
-    irregular meshes.
+    The same two steps as the paper (lift the ring to the tangent plane, differentiate scattered data there).
+    Non-negative weights give diffusion a maximum principle and its matrix no eigenvalue with positive real part.
+    Solutions are second order in the mesh size; the pointwise Laplacian is first order on irregular meshes. Where no
+    consistent non-negative row exists, the cotangent row of the intrinsic Delaunay triangulation takes its place.
 
     Attributes:
-        lift: ``"chord"`` keeps the length of every edge; ``"projection"`` is the paper's lift. Chord is better but for
-            the lowest modes of spheres.
+        lift: how the ring is laid into the plane. ``"intrinsic"`` unfolds it by edge lengths, so that bending the
+            surface, even along a crease, changes nothing. ``"chord"`` projects the ring to the tangent plane and keeps
+            the length of every edge; ``"projection"`` is the paper's lift. These two are accurate on smooth surfaces
+            only, where chord is better but for the lowest modes of spheres.
     """
 
-    lift: Lift = "chord"
+    lift: Literal["intrinsic", "chord", "projection"] = "intrinsic"
     degree: ClassVar[int] = 2
 
     def __post_init__(self):
-        if self.lift not in ("chord", "projection"):
-            raise ValueError(f'Expected lift="chord" or lift="projection", found {self.lift!r}.')
+        if self.lift not in ("intrinsic", "chord", "projection"):
+            raise ValueError(f'Expected lift="intrinsic", lift="chord" or lift="projection", found {self.lift!r}.')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +66,10 @@ class Polynomial:
     """Polynomial fits of degree 3 or 4 on about twice the neighbours they need, for smooth solutions on good meshes.
 
     Normals, gradient and Hessian come from the same fit, and the Laplacian takes the metric of the fitted surface into
-    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. Weights of both signs: there is no
-    maximum principle, and on bad meshes the Laplacian can have growing modes; `solve` looks for them before it steps.
+    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. Where the neighbours lie across a
+    crease the fit is made in the intrinsic chart of the vertex, which is exact where both sides are flat and first
+    order where they are curved. Weights of both signs: there is no maximum principle, and on bad meshes the Laplacian
+    can have growing modes; `solve` looks for them before it steps.
 
     Attributes:
         degree: 3 or 4.
@@ -70,7 +84,6 @@ class Polynomial:
 
 
 Scheme = Paper | Monotone | Polynomial
-PerBlock = tuple[AnyArray, ...]
 
 
 class Topology(eqx.Module):
@@ -88,6 +101,14 @@ class Topology(eqx.Module):
         num_components: how many components there are.
         jet: the neighbours of the gradient's fit.
         diffusion: the neighbours of the Laplacian; None where it is the divergence of the gradient.
+        jet_paths: for each block of ``jet`` the half-edges that lead to its neighbours; None where all rows are laid
+            out in space.
+        diffusion_paths: the same for ``diffusion``.
+        cotangent_rows: for each block of ``diffusion`` its rows that are those of the cotangent Laplacian, or None.
+        triangulation: the intrinsic Delaunay triangulation; None where all rows are laid out in space.
+        is_extrinsic: (V,) the rows that are laid out in space; None where all are laid out one way.
+        is_creased: (V,) the vertices whose neighbours lie across a crease, so that no height fit is made there; None
+            where there is none.
     """
 
     faces: Int[AnyArray, "F 3"]
@@ -99,6 +120,12 @@ class Topology(eqx.Module):
     jet: Table
     diffusion: Table | None
     components: Int[AnyArray, " V"]
+    jet_paths: tuple[Paths, ...] | None = None
+    diffusion_paths: tuple[Paths, ...] | None = None
+    cotangent_rows: tuple[CotangentRows, ...] | None = None
+    triangulation: Triangulation | None = None
+    is_extrinsic: Bool[AnyArray, " V"] | None = None
+    is_creased: Bool[AnyArray, " V"] | None = None
     num_loops: int = eqx.field(static=True, default=0)
     num_components: int = eqx.field(static=True, default=1)
 
@@ -109,7 +136,8 @@ class Geometry(eqx.Module):
     Attributes:
         vertices: (V, 3).
         normals: (V, 3) unit normals.
-        frames: (V, 2, 3) orthonormal tangent vectors; on a smooth boundary the second is the outward conormal.
+        frames: (V, 2, 3) orthonormal tangent vectors, turned like the chart of the vertex; on a smooth boundary the
+            second is the outward conormal.
         vertex_areas: (V,) a third of the area of the faces at each vertex.
         gradient_weights: two sets of weights on the jet table, for the two components in the frame.
         hessian_weights: three sets of weights on the jet table, for the components xx, xy, yy; None of `Paper`.
@@ -120,6 +148,7 @@ class Geometry(eqx.Module):
             every step; None where the table has no reverse.
         laplacian_residual: (V,) how far each Laplacian row is from consistent, relative, zero to rounding where it is;
             after moving the vertices it tells whether the frozen support still serves. None without such rows.
+        directions: lengths and directions in the charts of the vertices; None where all rows are laid out in space.
         conormals: (B, 2, 3) the outward conormals of both sides of each boundary vertex, equal where it is smooth.
         flux_weights: (B, 2) what a unit flux through each side adds to the Laplacian there; None without such rows.
     """
@@ -135,6 +164,7 @@ class Geometry(eqx.Module):
     laplacian_weights: PerBlock | None
     laplacian_reverse: ReverseWeights | None
     laplacian_residual: Float[AnyArray, " V"] | None
+    directions: Directions | None
     conormals: Float[AnyArray, "B 2 3"]
     flux_weights: Float[AnyArray, "B 2"] | None
 
@@ -151,55 +181,91 @@ def ring_normals(
     return ring.map(lambda block, topology: mean(offsets(vertices, block), topology), ring_blocks)
 
 
-def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
-    """The neighbours of a block's rows, seen from their vertex; exactly zero in an empty slot.
+def surface_normals(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Float[AnyArray, "V 3"]:
+    """The unit normals of a scheme: those of the paper, or else refined by the height fit of its degree.
 
-    Of a vertex whose position is computed in the same jit, XLA may compute the position anew for each side of the
-    difference and round it differently, and a slot that is nearly empty would count as a neighbour.
+    Where the fit's neighbours lie across a crease, the mean of the face normals weighted by angle: on the crease it
+    halves the angle between both sides, whatever the mesh.
     """
-    seen = block.neighbours(vertices) - block.centre(vertices)[None]
-    return seen.__array_namespace__().where(block.is_used[..., None], seen, 0)
+    ring, ring_blocks = topology.ring, topology.ring_blocks
+    normals = ring_normals(scheme, vertices, ring, ring_blocks)
+    if isinstance(scheme, Paper):
+        return normals
 
+    def refined(block):
+        return jets.refined_normals(offsets(vertices, block), block.centre(normals), scheme.degree)
 
-def fitted_normals(
-    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], jet: Table, degree: int
-) -> Float[AnyArray, "V 3"]:
-    """The given normals refined by the polynomial height fit on the jet table."""
-    return jet.map(lambda block: jets.refined_normals(offsets(vertices, block), block.centre(normals), degree))
+    fitted = topology.jet.map(refined)
+    if topology.is_creased is None:
+        return fitted
+    mean = ring.map(lambda block, rings: angle_weighted_normals(offsets(vertices, block), rings), ring_blocks)
+    return vertices.__array_namespace__().where(topology.is_creased[:, None], mean, fitted)
 
 
 def vertex_frames(
-    vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], topology: Topology
+    vertices: Float[AnyArray, "V 3"],
+    normals: Float[AnyArray, "V 3"],
+    topology: Topology,
+    angles: RingAngles | None = None,
 ) -> tuple[Float[AnyArray, "V 2 3"], Float[AnyArray, "B 2 3"]]:
     """Tangent frames, and the outward conormals of both sides of the boundary vertices.
 
     On a smooth boundary the second vector of the frame is the conormal, at a corner it is that of the first side.
+    Inside, where the angles of the rings are given, the frame is turned to where the ring in the chart comes closest to
+    the ring in the tangent plane.
     """
 
-    def frames(block, ring, kinds):
+    def frames(block, ring, kinds, *in_chart):
         to_neighbours = offsets(vertices, block)
-        here = block.centre(normals)
-        xp = here.__array_namespace__()
-        sides = corner_conormals(here, to_neighbours[0], last_slot(to_neighbours, ring))
-        smooth = boundary_frames(here, to_neighbours[0], last_slot(to_neighbours, ring))
+        normal = block.centre(normals)
+        xp = normal.__array_namespace__()
+        sides = corner_conormals(normal, to_neighbours[0], last_slot(to_neighbours, ring))
+        smooth = boundary_frames(normal, to_neighbours[0], last_slot(to_neighbours, ring))
         is_corner = (kinds >= jets.RIGHT_CORNER)[:, None, None]
-        first = xp.stack([xp.cross(sides[:, 0], here), sides[:, 0]], axis=1)
+        first = xp.stack([xp.cross(sides[:, 0], normal), sides[:, 0]], axis=1)
         along = xp.where(is_corner, first, smooth)
-        frame = xp.where((kinds == jets.INTERIOR)[:, None, None], tangent_frames(here), along)
+        inside = tangent_frames(normal)
+        if in_chart:
+            inside = intrinsic.aligned_frames(inside, normal, to_neighbours, ring, *in_chart)
+        frame = xp.where((kinds == jets.INTERIOR)[:, None, None], inside, along)
         both = xp.where(is_corner, sides, xp.stack([smooth[:, 1]] * 2, axis=1))
         return xp.concatenate([frame, both], axis=1)
 
     kinds = tuple(block.centre(topology.kinds) for block in topology.ring.blocks)
-    vectors = topology.ring.map(frames, topology.ring_blocks, kinds)
+    # `map` hands a batch of rows on with what belongs to them along the last axis.
+    chart = [] if angles is None else [angles.corners, tuple(b.centre(angles.sums) for b in topology.ring.blocks)]
+    vectors = topology.ring.map(frames, topology.ring_blocks, kinds, *chart)
     return vectors[:, :2], vectors[topology.boundary, 2:]
+
+
+def places(scheme: Scheme, geometry: Geometry) -> Places:
+    """What lays out the neighbours on a surface."""
+    return places_in(scheme, geometry.vertices, geometry.normals, geometry.frames, geometry.directions)
+
+
+def places_in(
+    scheme: Scheme,
+    vertices: Float[AnyArray, "V 3"],
+    normals: Float[AnyArray, "V 3"],
+    frames: Float[AnyArray, "V 2 3"],
+    directions: Directions | None,
+) -> Places:
+    """What lays out neighbours under a scheme, for given normals, frames and directions."""
+    lift = "projection" if scheme.lift == "projection" else "chord"
+    transport = "paper" if isinstance(scheme, Paper) else "shortest"
+    return Places(vertices, normals, frames, directions, lift, transport)
 
 
 def weigh(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Geometry:
     """All weights of a scheme, a pure function of the positions."""
-    normals = ring_normals(scheme, vertices, topology.ring, topology.ring_blocks)
-    if not isinstance(scheme, Paper):
-        normals = fitted_normals(vertices, normals, topology.jet, scheme.degree)
-    return weigh_in_frames(scheme, vertices, topology, normals, *vertex_frames(vertices, normals, topology))
+    normals, triangulation = surface_normals(scheme, vertices, topology), topology.triangulation
+    if triangulation is None:
+        frames, conormals = vertex_frames(vertices, normals, topology)
+        return weigh_in_frames(scheme, vertices, topology, normals, frames, conormals, None)
+    angles = intrinsic.ring_angles(vertices, triangulation, topology.ring, topology.ring_blocks)
+    frames, conormals = vertex_frames(vertices, normals, topology, angles)
+    directions = intrinsic.directions(angles, triangulation, topology.kinds)
+    return weigh_in_frames(scheme, vertices, topology, normals, frames, conormals, directions)
 
 
 def weigh_in_frames(
@@ -209,90 +275,120 @@ def weigh_in_frames(
     normals: Float[AnyArray, "V 3"],
     frames: Float[AnyArray, "V 2 3"],
     conormals: Float[AnyArray, "B 2 3"],
+    directions: Directions | None,
 ) -> Geometry:
-    """The weights of a scheme for given normals and tangent frames; operators do not depend on the choice of frames."""
+    """The weights of a scheme for given normals, tangent frames and directions in the charts.
+
+    Operators do not depend on the choice of frames, if the charts are turned with them.
+    """
     xp = vertices.__array_namespace__()
-
-    def jet(block, *ring):
-        to_neighbours = offsets(vertices, block)
-        lifted = lifted_ring(to_neighbours, block.centre(frames), scheme.lift)
-        if isinstance(scheme, Paper):
-            weights = xp.moveaxis(paper.gradient_weights(lifted, *ring), -1, 0)
-        else:
-            weights = jets.jet_weights(lifted, scheme.degree)
-        if isinstance(scheme, Polynomial):
-            weights = jets.covariant(jets.height_jet(to_neighbours, block.centre(normals), weights), weights)
-        # The divergence transports the neighbour's vector here and takes it against the weights; the same number is
-        # the neighbour's own components against the weights transported there.
-        ambient = xp.einsum("akn,nac->knc", weights[:2], block.centre(frames))
-        there = transport(block.centre(normals)[None], block.neighbours(normals), ambient)
-        return tuple(weights), tuple(xp.einsum("knc,knac->akn", there, block.neighbours(frames)))
-
-    per_block = topology.jet.each(jet, *([topology.ring_blocks] if isinstance(scheme, Paper) else []))
-    x, y, *second = zip(*(weights for weights, _ in per_block), strict=True)
-    gradient = (x, y)
-    along_x, along_y = zip(*(weights for _, weights in per_block), strict=True)
-    divergence = (along_x, along_y)
-    centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(divergence, gradient, strict=True)]
+    laying = places_in(scheme, vertices, normals, frames, directions)
+    lifted = laying.lifted(topology.jet, topology.jet_paths)
+    gradient, second = _jet_rows(scheme, vertices, normals, topology, lifted)
+    # The divergence takes the neighbour's components, turned into the frame of the vertex, against the weights.
+    x, y = gradient
+    turns = laying.turns(topology.jet, topology.jet_paths)
+    along = [
+        tuple(wx * turn[..., 0] + wy * turn[..., 1] for wx, wy, turn in zip(x, y, turns, strict=True)),
+        tuple(wy * turn[..., 0] - wx * turn[..., 1] for wx, wy, turn in zip(x, y, turns, strict=True)),
+    ]
+    centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(along, gradient, strict=True)]
     laplacian, backwards, residual, flux = None, None, None, None
-    if topology.diffusion is not None:
-        laplacian, residual, first = diffusion_rows(
-            cast(Monotone | Polynomial, scheme), vertices, normals, frames, topology.kinds, topology.diffusion
-        )
+    if not isinstance(scheme, Paper) and topology.diffusion is not None:
+        laplacian, residual, first = diffusion_rows(scheme, laying, topology)
         backwards = reverse_weights(topology.diffusion, laplacian)
-        flux = _flux_weights(first[topology.boundary], frames[topology.boundary], conormals)
+        sides = xp.einsum("bsc,bac->bsa", conormals, frames[topology.boundary])
+        if directions is not None:
+            sides = intrinsic.boundary_conormals(directions, topology.kinds, topology.boundary)
+        flux = _flux_weights(first[topology.boundary], sides)
     return Geometry(
         vertices=vertices,
         normals=normals,
         frames=frames,
         vertex_areas=_vertex_areas(vertices, topology),
         gradient_weights=gradient,
-        hessian_weights=(second[0], second[1], second[2]) if second else None,
-        divergence_weights=divergence,
+        hessian_weights=second,
+        divergence_weights=(along[0], along[1]),
         divergence_centre=xp.stack(centre, axis=-1),
         laplacian_weights=laplacian,
         laplacian_reverse=backwards,
         laplacian_residual=residual,
+        directions=directions,
         conormals=conormals,
         flux_weights=flux,
     )
 
 
-def diffusion_rows(
-    scheme: Monotone | Polynomial,
-    vertices: Float[AnyArray, "V 3"],
-    normals: Float[AnyArray, "V 3"],
-    frames: Float[AnyArray, "V 2 3"],
-    kinds: Int[AnyArray, " V"],
-    table: Table,
-) -> tuple[PerBlock, Float[AnyArray, " V"], Float[AnyArray, "V 2"]]:
-    """The Laplacian weights on a table, the relative moment residual of every row, and its first moments."""
+def _jet_rows(
+    scheme: Scheme, vertices: AnyArray, normals: AnyArray, topology: Topology, lifted: PerBlock
+) -> tuple[tuple[PerBlock, PerBlock], tuple[PerBlock, PerBlock, PerBlock] | None]:
+    """The weights of the two first and the three second derivatives on the jet table; `Paper` has no second ones."""
+    if isinstance(scheme, Paper):
+        blocks = [paper.gradient_weights(*row) for row in zip(lifted, topology.ring_blocks, strict=True)]
+        return (tuple(w[..., 0] for w in blocks), tuple(w[..., 1] for w in blocks)), None
 
-    def rows(block):
-        to_neighbours = offsets(vertices, block)
-        lifted = lifted_ring(to_neighbours, block.centre(frames), scheme.lift)
+    def jet(block, lifted):
         xp = lifted.__array_namespace__()
+        weights = jets.jet_weights(xp.moveaxis(lifted, -1, 1), scheme.degree)
+        if isinstance(scheme, Polynomial):
+            weights = jets.covariant(_height(vertices, normals, topology, block, weights), weights)
+        return tuple(weights)
+
+    x, y, xx, xy, yy = zip(*topology.jet.each(jet, rows_last(lifted)), strict=True)
+    return (x, y), (xx, xy, yy)
+
+
+def _height(vertices, normals, topology: Topology, block, weights):
+    """The jet of the surface's height over the tangent planes of a block's rows; zero for those laid out in charts."""
+    height = jets.height_jet(offsets(vertices, block), block.centre(normals), weights)
+    if topology.triangulation is None:
+        return height
+    if topology.is_extrinsic is None:
+        return 0 * height
+    return height.__array_namespace__().where(block.centre(topology.is_extrinsic)[None], height, 0)
+
+
+def diffusion_rows(
+    scheme: Monotone | Polynomial, laying: Places, topology: Topology
+) -> tuple[PerBlock, Float[AnyArray, " V"], Float[AnyArray, "V 2"]]:
+    """The Laplacian weights on their table, the relative moment residual of every row, and its first moments."""
+    table = topology.diffusion
+    assert table is not None
+    lifted = laying.lifted(table, topology.diffusion_paths)
+
+    def rows(block, lifted):
+        xp = lifted.__array_namespace__()
+        lifted = xp.moveaxis(lifted, -1, 1)
         targets = xp.asarray(jets.LAPLACIAN, dtype=lifted.dtype)[..., None]
         if isinstance(scheme, Polynomial):
             weights = jets.jet_weights(lifted, scheme.degree)
-            targets = jets.laplacian_targets(jets.height_jet(to_neighbours, block.centre(normals), weights))
+            targets = jets.laplacian_targets(_height(laying.vertices, laying.normals, topology, block, weights))
         c, residual = jets.operator_weights(
-            lifted, block.centre(kinds), targets, scheme.degree, nonnegative=isinstance(scheme, Monotone)
+            lifted, block.centre(topology.kinds), targets, scheme.degree, nonnegative=isinstance(scheme, Monotone)
         )
-        return c[0], residual[0], xp.einsum("kn,kna->an", c[0], lifted)
+        return c[0], residual[0]
 
-    weights, residuals, first = zip(*table.each(rows), strict=True)
-    return weights, table.rows_from(list(residuals)), table.rows_from([moments.T for moments in first])
+    weights, residuals = zip(*table.each(rows, rows_last(lifted)), strict=True)
+    if topology.cotangent_rows is not None and laying.directions is not None:
+        replaced = [
+            intrinsic.replace_rows(*block, laying.directions)
+            for block in zip(weights, topology.cotangent_rows, strict=True)
+        ]
+        weights = tuple(replaced)
+    xp = laying.vertices.__array_namespace__()
+    first = [xp.einsum("kn,kna->na", c, places) for c, places in zip(weights, lifted, strict=True)]
+    return weights, table.rows_from(list(residuals)), table.rows_from(first)
 
 
-def _flux_weights(first, frames, conormals):
-    """The weights (B, 2) of the fluxes through both sides, from the first moments (B, 2) of the Laplacian rows.
+def _flux_weights(first, conormals):
+    """The weights (B, 2) of the fluxes through both sides, from the first moments (B, 2) of the Laplacian rows and the
+    conormals (B, 2, 2) of the sides in the frame.
 
     The rows leave ``-first . grad u`` over. On a smooth boundary the gradient's part along it has no weight; at a
     corner the gradient g solves conormal . g = flux for both sides.
     """
     xp = first.__array_namespace__()
-    a, b = xp.moveaxis(xp.einsum("bsc,bac->bsa", conormals, frames), 1, 0)
+    a, b = xp.moveaxis(conormals, 1, 0)
     determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     is_corner = xp.abs(determinant) > _PARALLEL
     safe = xp.where(is_corner, determinant, 1)

@@ -1,7 +1,7 @@
 """Which neighbours a row uses: chosen once, on the host, from the positions; frozen afterwards.
 
-What enters: the one-rings, and how to lay neighbours into tangent planes. What leaves: rows of neighbours (offsets and
-indices), for the fit of a polynomial and for non-negative operators, and a record of how the latter were found.
+What enters: for any vertices, their neighbours within a few edges and where these lie in the plane. What leaves: rows
+of neighbours, for the fit of a polynomial and for non-negative operators, and a record of how the latter were found.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from scipy.optimize import nnls
 
+from .charts import Charts, Neighbourhood
 from .jets import conditions, moment_matrix, num_monomials, relative_residual, ring_moments, scaled_targets
 from .ring import Lift, lifted_ring
 
@@ -23,16 +24,49 @@ _PLACED = 1e-8
 CONSISTENT = 1e-8
 # Rings beyond the third reach so far that a row would no longer be local.
 LARGEST_RING = 3
+# The widest rings of a fit, by its degree.
+LARGEST_FIT = {2: 3, 3: 5, 4: 5}
 # Vertices at once.
 _BATCH = 1 << 13
 
-Rows = tuple[np.ndarray, np.ndarray]
-# All vertices within k edges of each of the given vertices, as rows.
-KRing = Callable[[np.ndarray, int], Rows]
-# Lifted coordinates (K, N, 2) of neighbours (K, N) of vertices (N,).
-LiftAt = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# The neighbourhood of vertices (N,) within k edges.
+Reach = Callable[[np.ndarray, int], Neighbourhood]
 # Hands on the batches it is given, and may show how far they are.
 Watch = Callable[[list[np.ndarray]], Iterable[np.ndarray]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """The neighbours of every vertex that an operator uses.
+
+    Attributes:
+        offsets: (V + 1,) where the entries of each vertex begin.
+        members: (n,) the neighbours.
+        paths: (n, R) the half-edges that lead to them, as of `Neighbourhood`.
+    """
+
+    offsets: np.ndarray
+    members: np.ndarray
+    paths: np.ndarray
+
+    @classmethod
+    def all_of(cls, around: Neighbourhood) -> "Rows":
+        """The rows that hold whole neighbourhoods, one for every vertex."""
+        return cls(around.offsets, around.members, around.paths)
+
+    def replaced(self, owners: np.ndarray, members: np.ndarray, paths: np.ndarray, which: np.ndarray) -> "Rows":
+        """The rows with those of the vertices ``which`` replaced by entries (n,) that name their owners."""
+        is_kept = np.ones(len(self.offsets) - 1, bool)
+        is_kept[which] = False
+        own = np.repeat(np.arange(len(is_kept)), np.diff(self.offsets))
+        stays = is_kept[own]
+        owners = np.concatenate([own[stays], owners])
+        order = np.argsort(owners, kind="stable")
+        return Rows(
+            np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=len(is_kept)))]),
+            np.concatenate([self.members[stays], members])[order].astype(self.members.dtype),
+            np.concatenate([self.paths[stays], paths])[order].astype(np.int32),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,18 +87,55 @@ class SupportRecord:
         return np.flatnonzero(~(self.residual <= CONSISTENT))
 
 
-def lift_onto(vertices: np.ndarray, frames: np.ndarray, lift: Lift) -> LiftAt:
-    """The lift of any neighbours of a vertex into its tangent plane."""
+def reach_in_space(
+    vertices: np.ndarray,
+    frames: np.ndarray,
+    lift: Lift,
+    k_ring: Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]],
+    longest_path: int = 0,
+    no_half_edge: int = 0,
+) -> Reach:
+    """Neighbourhoods along the edges of the mesh, laid into the tangent planes.
 
-    def lift_at(rows: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-        return lifted_ring(vertices[neighbours] - vertices[rows][None], frames[rows], lift)
+    Args:
+        vertices: (V, 3) positions.
+        frames: (V, 2, 3) the bases of the tangent planes.
+        lift: how neighbours are laid into them.
+        k_ring: the vertices within k edges of each of the given ones, as offsets and members.
+        longest_path: the number of half-edges that paths have room for.
+        no_half_edge: the half-edge of length zero.
+    """
 
-    return lift_at
+    def reach(which: np.ndarray, rings: int) -> Neighbourhood:
+        offsets, members = k_ring(which, rings)
+        own = np.repeat(which, np.diff(offsets))
+        lifted = lifted_ring((vertices[members] - vertices[own])[None], frames[own], lift)[0]
+        return Neighbourhood(offsets, members, lifted, np.full((len(members), longest_path), no_half_edge, np.int32))
+
+    return reach
 
 
-def fit_support(
-    rings: Rows, degree: int, k_ring: KRing, lift_at: LiftAt, watch: Watch
-) -> tuple[Rows, np.ndarray, np.ndarray]:
+def reach_in_charts(charts: Charts, in_space: Reach, is_extrinsic: np.ndarray | None) -> Reach:
+    """Neighbourhoods in the charts of the vertices, but in space for those that are marked."""
+    if is_extrinsic is None:
+        return charts.around
+
+    def reach(which: np.ndarray, rings: int) -> Neighbourhood:
+        outside = is_extrinsic[which]
+        if not outside.any():
+            return charts.around(which, rings)
+        parts = [(outside, in_space), (~outside, charts.around)]
+        found = [(np.flatnonzero(mask), find(which[mask], rings)) for mask, find in parts]
+        return Neighbourhood.gather(
+            np.concatenate([where[part.owners] for where, part in found]),
+            len(which),
+            *(np.concatenate([getattr(part, name) for _, part in found]) for name in ("members", "lifted", "paths")),
+        )
+
+    return reach
+
+
+def fit_support(rings: Rows, degree: int, reach: Reach, watch: Watch) -> tuple[Rows, np.ndarray, np.ndarray]:
     """Rows that determine a polynomial fit.
 
     A quadratic is fitted on the one-ring where that determines it, else on two rings, else on three. Higher degrees
@@ -77,14 +148,13 @@ def fit_support(
     choices = (
         [(1, None), (2, None), (3, None)]
         if degree == 2
-        else [(3, 2 * num_monomials(degree)), (3, None), (4, None), (5, None)]
+        else [(3, 2 * num_monomials(degree)), (3, None), (4, None), (LARGEST_FIT[degree], None)]
     )
-    rows, wanting = rings, np.arange(len(rings[0]) - 1)
-    wide = wanting
+    rows, remaining = rings, np.arange(len(rings.offsets) - 1)
+    wide = remaining
     for attempt, (ring, nearest) in enumerate(choices):
-        found = _Found()
-        for batch, candidates in _candidates(wanting, rings, ring, k_ring, watch):
-            lifted = lift_at(batch, candidates)
+        chosen = _Chosen()
+        for batch, candidates, lifted, paths in _candidates(remaining, rings, ring, reach, watch):
             is_used = candidates != batch[None]
             if nearest is not None and nearest < len(candidates):
                 distance = np.where(is_used, np.sum(lifted**2, axis=-1), np.inf)
@@ -92,12 +162,12 @@ def fit_support(
                 lifted = np.where(is_used[..., None], lifted, 0)
             is_last = attempt == len(choices) - 1
             enough = _PLACED if is_last else _WELL_PLACED[degree]
-            found.add(batch, candidates, is_used, fit_quality(lifted, degree) > enough)
-        rows = found.replace(rows)
-        wanting = found.wanting()
+            chosen.add(batch, candidates, paths, is_used, fit_quality(lifted, degree) > enough)
+        rows = chosen.replace(rows)
+        remaining = chosen.insufficient()
         if attempt == 0:
-            wide = wanting
-    return rows, wide, wanting
+            wide = remaining
+    return rows, wide, remaining
 
 
 def fit_quality(lifted: np.ndarray, degree: int) -> np.ndarray:
@@ -114,8 +184,7 @@ def nonnegative_support(
     is_good: np.ndarray,
     kinds: np.ndarray,
     targets: np.ndarray,
-    k_ring: KRing,
-    lift_at: LiftAt,
+    reach: Reach,
     watch: Watch,
     emphasis: float = 1.0,
 ) -> tuple[Rows, SupportRecord]:
@@ -130,8 +199,7 @@ def nonnegative_support(
         is_good: (V,) whether the one-ring's weights are non-negative and consistent.
         kinds: (V,) which conditions a vertex keeps.
         targets: (5, V) or (5, 1) what the operator makes of x, y, xy, x^2, y^2.
-        k_ring: the wider rings.
-        lift_at: the lifted coordinates of neighbours.
+        reach: the wider rings.
         watch: shows how far the choice has come.
         emphasis: as in `jets.operator_weights`.
     """
@@ -139,18 +207,20 @@ def nonnegative_support(
     rows = rings
     record = SupportRecord(np.ones(num_vertices, np.int8), np.where(is_good, 0, np.inf))
     targets = np.broadcast_to(targets, (5, num_vertices))
-    wanting = np.flatnonzero(~is_good)
+    remaining = np.flatnonzero(~is_good)
     for ring in range(2, LARGEST_RING + 1):
-        found = _Found()
-        for batch, candidates in _candidates(wanting, rings, ring, k_ring, watch):
-            lifted = lift_at(batch, candidates)
+        chosen = _Chosen()
+        for batch, candidates, lifted, paths in _candidates(remaining, rings, ring, reach, watch):
             is_picked, residual = _nonnegative_rows(lifted, kinds[batch], targets[:, batch], emphasis)
             is_better = residual < record.residual[batch]
-            here = batch[is_better]
-            record.rings[here], record.residual[here] = ring, residual[is_better]
-            found.add(here, candidates[:, is_better], is_picked[:, is_better], np.ones(len(here), bool))
-        rows = found.replace(rows)
-        wanting = wanting[~(record.residual[wanting] <= CONSISTENT)]
+            better = batch[is_better]
+            record.rings[better], record.residual[better] = ring, residual[is_better]
+            columns = np.flatnonzero(is_better)
+            chosen.add(
+                better, candidates[:, columns], paths[:, columns], is_picked[:, columns], np.ones(len(better), bool)
+            )
+        rows = chosen.replace(rows)
+        remaining = remaining[~(record.residual[remaining] <= CONSISTENT)]
     return rows, record
 
 
@@ -169,11 +239,15 @@ def _nonnegative_rows(
         )
         target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
         matrices = np.ascontiguousarray(np.moveaxis(moments * weights[None], -1, 0))
-        c = np.zeros(weights.shape)
+        c, has_failed = np.zeros(weights.shape), np.zeros(len(todo), bool)
         for i, (matrix, right) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
-            c[:, i] = nnls(matrix, right)[0]
+            try:
+                c[:, i] = nnls(matrix, right)[0]
+            except RuntimeError:  # SciPy's iteration did not end
+                has_failed[i] = True
         reached = np.einsum("ikn,kn->in", moments, weights * c)
         residual[todo] = relative_residual(target[None], reached[None], emphasis)[0]
+        residual[todo[has_failed]] = np.inf
         changed = np.any(is_picked[:, todo] != (c > 0), axis=0) & np.any(c > 0, axis=0)
         is_picked[:, todo] = c > 0
         todo = todo[changed & ~(residual[todo] <= CONSISTENT)]
@@ -183,63 +257,55 @@ def _nonnegative_rows(
 
 
 def _candidates(
-    vertices: np.ndarray, rings: Rows, ring: int, k_ring: KRing, watch: Watch
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The rings of some vertices, a batch at a time: vertices (N,) and neighbours (K, N), padded with the vertex."""
-    lengths = np.diff(rings[0])[vertices]
-    # Rings of about the same size together, so that a pole of valence 500 pads only its like.
+    vertices: np.ndarray, rings: Rows, ring: int, reach: Reach, watch: Watch
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """The rings of some vertices, a batch at a time: vertices (N,), neighbours (K, N), padded with the vertex, their
+    places (K, N, 2), padded with zeros, and their paths (K, N, R)."""
+    lengths = np.diff(rings.offsets)[vertices]
+    # Rings of about the same size together, so that a pole of valence 500 pads only rows of its own size.
     vertices = vertices[np.argsort(lengths, kind="stable")]
     batches = [vertices[start : start + _BATCH] for start in range(0, len(vertices), _BATCH)]
     for batch in watch(batches):
-        offsets, members = _rows_at(rings, batch) if ring == 1 else k_ring(batch, ring)
-        sizes = np.diff(offsets)
+        around = reach(batch, ring)
+        sizes = np.diff(around.offsets)
         # A long row must not pad the whole batch.
         by_size = np.argsort(sizes, kind="stable")
         cuts = np.flatnonzero(np.diff(np.ceil(np.log2(np.maximum(sizes[by_size], 16))))) + 1
+        # An empty slot reads one more entry, behind the last.
+        places = np.append(around.lifted, np.zeros((1, 2)), axis=0)
+        paths = np.append(around.paths, np.zeros((1, around.paths.shape[1]), np.int32), axis=0)
         for part in np.split(by_size, cuts):
             slot = np.arange(sizes[part].max(initial=0))[:, None]
-            position = np.minimum(offsets[part] + slot, max(len(members) - 1, 0))
+            is_used = slot < sizes[part]
+            entry = np.where(is_used, around.offsets[part] + slot, len(around.members))
             own = batch[part]
-            yield own, np.where(slot < sizes[part], members[position] if len(members) else own, own)
+            yield own, np.where(is_used, np.append(around.members, 0)[entry], own), places[entry], paths[entry]
 
 
-def _rows_at(rows: Rows, vertices: np.ndarray) -> Rows:
-    """The rows of some vertices."""
-    offsets, members = rows
-    sizes = np.diff(offsets)[vertices]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    position = np.arange(starts[-1]) + np.repeat(offsets[vertices] - starts[:-1], sizes)
-    return starts, members[position]
-
-
-class _Found:
-    """Rows found for some of the vertices, batch by batch."""
+class _Chosen:
+    """Rows chosen for some of the vertices, batch by batch."""
 
     def __init__(self):
-        none = np.zeros(0, np.int64)
-        self._vertices, self._owners, self._members, self._is_good = [none], [none], [none], [np.zeros(0, bool)]
+        self._vertices, self._entries, self._is_good = [], [], []
 
-    def add(self, vertices: np.ndarray, candidates: np.ndarray, is_used: np.ndarray, is_good: np.ndarray) -> None:
-        """The used ones of the candidates (K, N) of vertices (N,), and whether each row will do."""
+    def add(
+        self, vertices: np.ndarray, candidates: np.ndarray, paths: np.ndarray, is_used: np.ndarray, is_good: np.ndarray
+    ) -> None:
+        """The used ones of the candidates (K, N) of vertices (N,), their paths, and whether each row suffices."""
         column, slot = np.nonzero(is_used.T)
         self._vertices.append(vertices)
-        self._owners.append(vertices[column])
-        self._members.append(candidates[slot, column])
+        self._entries.append((vertices[column], candidates[slot, column], paths[slot, column]))
         self._is_good.append(is_good)
 
-    def wanting(self) -> np.ndarray:
-        """The vertices whose row will not do."""
+    def insufficient(self) -> np.ndarray:
+        """The vertices whose row does not suffice."""
+        if not self._vertices:
+            return np.zeros(0, np.int64)
         return np.sort(np.concatenate(self._vertices)[~np.concatenate(self._is_good)])
 
     def replace(self, rows: Rows) -> Rows:
         """All rows, with those of these vertices replaced."""
-        offsets, members = rows
-        is_kept = np.ones(len(offsets) - 1, bool)
-        is_kept[np.concatenate(self._vertices)] = False
-        owners = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-        stays = is_kept[owners]
-        owners = np.concatenate([owners[stays], *self._owners])
-        members = np.concatenate([members[stays], *self._members])
-        order = np.argsort(owners, kind="stable")
-        sizes = np.bincount(owners, minlength=len(offsets) - 1)
-        return np.concatenate([[0], np.cumsum(sizes)]), members[order].astype(rows[1].dtype)
+        if not self._vertices:
+            return rows
+        owners, members, paths = map(np.concatenate, zip(*self._entries, strict=True))
+        return rows.replaced(owners, members, paths, np.concatenate(self._vertices))

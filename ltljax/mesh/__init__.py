@@ -8,7 +8,19 @@ from . import shapes
 from .errors import MeshError
 from .files import load_mesh
 from .mesh import Mesh
-from .report import MeshReport
-from .topology import OneRings, k_ring, one_rings
+from .report import MeshReport, corner_angles
+from .topology import OneRings, half_edges, k_ring, one_rings, shared_edges
 
-__all__ = ["Mesh", "MeshError", "MeshReport", "OneRings", "k_ring", "load_mesh", "one_rings", "shapes"]
+__all__ = [
+    "Mesh",
+    "MeshError",
+    "MeshReport",
+    "OneRings",
+    "corner_angles",
+    "half_edges",
+    "k_ring",
+    "load_mesh",
+    "one_rings",
+    "shapes",
+    "shared_edges",
+]

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from ..curvature import curvature
 from ..lifting.frames import transport
-from ..operators import curvature
 from ..solve import direction_field
 from ..surface import Surface
 from ..vectors import rotated, tangential

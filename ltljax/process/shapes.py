@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import imaging
+from ..curvature import curvature as curvature_of
 from ..mesh.columns import read_colors
-from ..operators import curvature as curvature_of
 from ..solve import geodesic_distance
 from .fields import FIELDS, line_fields
 from .results import Results, symmetric, usual

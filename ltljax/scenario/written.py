@@ -18,11 +18,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..curvature import curvature
 from ..elliptic import direction_tensor, elliptic_stencil
 from ..equations import CahnHilliard, Diffusion, Equation, ReactionDiffusion, kinetics
 from ..formulas import Formula, cut
 from ..mesh import Mesh, MeshError, load_mesh, shapes
-from ..operators import curvature
 from ..output.colors import COLORMAPS
 from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface

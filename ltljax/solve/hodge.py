@@ -13,8 +13,9 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
+from ..curvature import curvature
 from ..equations import Dirichlet, Neumann
-from ..operators import curvature, divergence, gradient
+from ..operators import divergence, gradient
 from ..surface import Surface
 from ..tables import AnyArray
 from ..vectors import check_vectors, curl, tangential

@@ -24,7 +24,8 @@ import scipy.linalg
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
-from ..lifting.schemes import Monotone, PerBlock
+from ..lifting.layout import PerBlock
+from ..lifting.schemes import Monotone
 from ..mesh import Mesh
 from ..operators import laplacian_matrix
 from ..surface import Surface

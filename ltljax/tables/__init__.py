@@ -17,6 +17,8 @@ from .table import (
     reverse_weights,
     reversible,
     slot_sum,
+    slot_values,
+    take,
     weighted_table,
 )
 
@@ -34,5 +36,7 @@ __all__ = [
     "reverse_weights",
     "reversible",
     "slot_sum",
+    "slot_values",
+    "take",
     "weighted_table",
 ]

@@ -49,6 +49,10 @@ class Block(eqx.Module):
         own = np.arange(self.indices.shape[1], dtype=np.int32) if self.rows is None else self.rows
         return self.indices != own[None]
 
+    def part(self, columns: Int[AnyArray, " n"]) -> "Block":
+        """The block of some of its columns."""
+        return Block(self.indices[:, columns], columns if self.rows is None else self.rows[columns])
+
     def centre(self, values: AnyArray) -> AnyArray:
         """The values at this block's own rows: (V, ...) -> (N, ...)."""
         return values if self.rows is None else take(values, self.rows)
@@ -171,8 +175,19 @@ def weighted_table(matrix: scipy.sparse.csr_array) -> tuple[Table, tuple[np.ndar
     order = np.argsort(rows, kind="stable")
     lengths = np.bincount(rows, minlength=entries.shape[0])
     offsets = np.concatenate([[0], np.cumsum(lengths)])
-    weights = tuple(_slots(part, offsets, values[order], lengths, 0.0) for part in _division(lengths))
-    return build_table(offsets, columns[order]), weights
+    return build_table(offsets, columns[order]), slot_values(offsets, values[order], 0.0)
+
+
+def slot_values(offsets: np.ndarray, values: np.ndarray, empty: float | int) -> tuple[np.ndarray, ...]:
+    """Values of the entries of rows in the layout of `build_table`: one array (K, N) per block (host).
+
+    Args:
+        offsets: (V + 1,) integers, as for `build_table`.
+        values: (sum of lengths,) one value per entry.
+        empty: the value of an empty slot.
+    """
+    lengths = np.diff(offsets)
+    return tuple(_slots(part, offsets, values, lengths, empty) for part in _division(lengths))
 
 
 def reversible(table: Table) -> Table:

@@ -1,0 +1,129 @@
+"""Where the neighbours of every row lie in the plane of their vertex, and how their vectors turn on the way there.
+
+What enters: positions, frames and directions. What leaves: for each block of a table the lifted neighbours (K, N, 2)
+and the turns (K, N, 2), cosine and sine, that take components in the frame of a neighbour to the frame of the vertex.
+
+Rows are laid out in one of two ways: by edge lengths alone in the chart of the vertex (`intrinsic`), or in space in its
+tangent plane (`ring`). The first is the default; the second serves the other lifts, and faces that are folded over.
+"""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..tables import AnyArray, Block, Table, slot_values
+from .frames import transport
+from .intrinsic import Directions, Paths, lay_out, with_columns
+from .ring import Lift, lifted_ring
+
+PerBlock = tuple[AnyArray, ...]
+
+
+class Places(eqx.Module):
+    """What lays out neighbours: the arrays of a surface that a layout depends on.
+
+    Attributes:
+        vertices: (V, 3) positions.
+        normals: (V, 3) unit normals.
+        frames: (V, 2, 3) tangent frames, turned like the charts.
+        directions: lengths and directions in the charts; None where all rows are laid out in space.
+        lift: how rows in space are laid into tangent planes.
+        transport: how rows in space turn vectors: by the shortest rotation between the normals, or as in the paper.
+    """
+
+    vertices: Float[AnyArray, "V 3"]
+    normals: Float[AnyArray, "V 3"]
+    frames: Float[AnyArray, "V 2 3"]
+    directions: Directions | None
+    lift: Lift = eqx.field(static=True)
+    transport: Literal["shortest", "paper"] = eqx.field(static=True, default="shortest")
+
+    def lifted(self, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
+        """The neighbours in the plane of their vertex, (K, N, 2) for each block.
+
+        Args:
+            table: the neighbours.
+            paths: for each block the half-edges that lead to them; None where all rows are laid out in space.
+        """
+        return self._each(table, paths, self._lifted_in_space, lambda lifted, _: lifted)
+
+    def turns(self, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
+        """The cosine and sine (K, N, 2) of the angle by which transport turns components, for each block."""
+
+        def in_chart(_, angle):
+            xp = angle.__array_namespace__()
+            return xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
+
+        return self._each(table, paths, self._turns_in_space, in_chart)
+
+    def _each(self, table: Table, paths: tuple[Paths, ...] | None, in_space: Any, in_chart: Any) -> PerBlock:
+        if paths is None or self.directions is None:
+            # A table joins results along their last axis, which is that of the rows.
+            return rows_last(tuple(table.each(lambda block: rows_last((in_space(block),))[0])), to=1)
+        return tuple(
+            with_columns(in_chart(*lay_out(self.directions, path)), path.in_space, in_space(block.part(path.in_space)))
+            for block, path in zip(table.blocks, paths, strict=True)
+        )
+
+    def _lifted_in_space(self, block: Block) -> AnyArray:
+        return lifted_ring(offsets(self.vertices, block), block.centre(self.frames), self.lift)
+
+    def _turns_in_space(self, block: Block) -> AnyArray:
+        frame, near = block.centre(self.frames)[None], block.neighbours(self.frames)
+        xp = self.vertices.__array_namespace__()
+        if self.transport == "shortest":
+            first = transport(block.neighbours(self.normals), block.centre(self.normals)[None], near[..., 0, :])
+            return xp.einsum("knac,knc->kna", xp.broadcast_to(frame, near.shape), first)
+        edge = offsets(self.vertices, block)
+        leaving, arriving = (
+            xp.einsum("knac,knc->kna", xp.broadcast_to(basis, near.shape), edge) for basis in (frame, near)
+        )
+        # The quotient of both directions as complex numbers, at length one; where an edge has none, no turn.
+        real = xp.sum(leaving * arriving, axis=-1)
+        imaginary = leaving[..., 1] * arriving[..., 0] - leaving[..., 0] * arriving[..., 1]
+        squared = real**2 + imaginary**2
+        size = xp.sqrt(xp.where(squared > 0, squared, 1))
+        turned = xp.stack([real / size, imaginary / size], axis=-1)
+        return xp.where((squared > 0)[..., None], turned, xp.asarray([1, 0], dtype=edge.dtype))
+
+
+def rows_last(lifted: PerBlock, to: int = -1) -> PerBlock:
+    """Lifted rings (K, N, 2) of all blocks with their rows last, (K, 2, N), as a table hands them on in batches; with
+    ``to=1`` back again."""
+    return tuple(values.__array_namespace__().moveaxis(values, 1 if to == -1 else -1, to) for values in lifted)
+
+
+def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
+    """The neighbours of a block's rows, seen from their vertex; exactly zero in an empty slot.
+
+    Of a vertex whose position is computed in the same jit, XLA may compute the position anew for each side of the
+    difference and round it differently, and a slot that is nearly empty would count as a neighbour.
+    """
+    seen = block.neighbours(vertices) - block.centre(vertices)[None]
+    return seen.__array_namespace__().where(block.is_used[..., None], seen, 0)
+
+
+def block_paths(
+    table: Table, row_offsets: np.ndarray, paths: np.ndarray, no_half_edge: int, is_extrinsic: np.ndarray | None
+) -> tuple[Paths, ...]:
+    """The paths (n, R) of the entries of rows, in the blocks of their table (host).
+
+    Args:
+        table: the table of the rows.
+        row_offsets: (V + 1,) where the entries of each row begin.
+        paths: (n, R) the half-edges that lead to each entry.
+        no_half_edge: the half-edge of length zero.
+        is_extrinsic: (V,) the rows that are laid out in space, if any.
+    """
+    steps = [slot_values(row_offsets, hop, no_half_edge) for hop in paths.T]
+    blocks = []
+    for block, first, *further in zip(table.blocks, *steps, strict=True):
+        goes_on = [np.any(hop != no_half_edge, axis=0) for hop in further]
+        columns = np.flatnonzero(np.any(goes_on, axis=0)) if further else np.zeros(0, int)
+        used = [hop[:, columns] for hop, has in zip(further, goes_on, strict=True) if has.any()]
+        stacked = np.stack(used) if used else np.zeros((0, len(first), 0))
+        in_space = np.zeros(0) if is_extrinsic is None else np.flatnonzero(block.centre(is_extrinsic))
+        blocks.append(Paths(*(a.astype(np.int32) for a in (first, columns, stacked, in_space))))
+    return tuple(blocks)
