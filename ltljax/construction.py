@@ -322,7 +322,7 @@ def _lay_charts(
     topology = dataclasses.replace(
         topology, triangulation=triangulation, is_extrinsic=is_extrinsic if is_extrinsic.any() else None
     )
-    num_flips = sum(len(level.flipped) for level in triangulation.levels)
+    num_flips = int(np.sum(triangulation.flips.flipped < len(triangulation.tails)))
     return topology, _Chart(half_edges, angles, chart_directions, charts, num_flips)
 
 

@@ -32,24 +32,6 @@ def strip(n, degrees, amount=0.3, diagonals="random"):
     return ltl.Mesh(bent, np.concatenate([one, other])), x
 
 
-def cube(n):
-    """The surface of the unit cube with n x n cells on each side, whose diagonals alternate."""
-    grid = np.array(np.meshgrid(*[np.arange(n + 1)] * 2, indexing="ij")).reshape(2, -1).T
-    corner = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
-    is_odd = (grid.sum(axis=1) % 2).reshape(corner.shape)[:-1, :-1].reshape(-1, 1) == 1
-    one = np.where(is_odd, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
-    other = np.where(is_odd, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
-    cells = np.concatenate([one, other])
-    vertices, faces = [], []
-    for axis in range(3):
-        for side in (0, n):
-            place = np.insert(grid, axis, side, axis=1)
-            faces.append((cells[:, ::-1] if (side == 0) == (axis != 1) else cells) + len(vertices) * len(grid))
-            vertices.append(place)
-    return ltl.Mesh(np.concatenate(vertices) / n, np.concatenate(faces), weld=True)
-
-
 def cone(half_angle, rings):
     """A cone with generators of length 1 and its tip at the origin; r along the generators, and the angle about it."""
     vertices, radius, angle = [np.zeros(3)], [0.0], [0.0]
@@ -127,7 +109,7 @@ def poisson_error(matrix, u, rate):
 
 
 def test_eigenvalues_of_the_cube():
-    matrix = -ltl.laplacian_matrix(ltl.Surface.from_mesh(cube(40))).tocsc()
+    matrix = -ltl.laplacian_matrix(ltl.Surface.from_mesh(ltl.shapes.box(n=40))).tocsc()
     values = scipy.sparse.linalg.eigs(matrix, k=7, sigma=-0.1, return_eigenvectors=False)
     exact = np.repeat([4.16609, 11.49918], 3)
     np.testing.assert_allclose(np.sort(values.real)[1:], exact, rtol=7e-4)
@@ -258,14 +240,14 @@ def saddle(turns):
 
 def blade(n, thickness):
     """A square plate of almost no thickness, both of its sides and its rim."""
-    mesh = cube(n)
+    mesh = ltl.shapes.box(n=n)
     return ltl.Mesh(mesh.vertices * [1, 1, thickness], mesh.faces)
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: cube(8),
+        lambda: ltl.shapes.box(n=8),
         lambda: strip(8, 179)[0],
         lambda: blade(8, 1e-4),
         lambda: blade(8, 1e-8),

@@ -202,3 +202,17 @@ def test_bad_arguments_are_value_errors_that_name_them(make, message):
     with pytest.raises(ValueError, match=message) as caught:
         make()
     assert not isinstance(caught.value, MeshError)
+
+
+@pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (1.0, 2.0, 0.5)])
+def test_a_box_has_its_sides(sides):
+    mesh = shapes.box(sides, n=8)
+    a, b, c = sides
+    assert mesh.is_closed
+    assert mesh.report.euler_number == 2
+    assert mesh.report.reoriented_faces == 0
+    assert mesh.area == pytest.approx(2 * (a * b + b * c + c * a))
+    np.testing.assert_allclose([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], [[0, 0, 0], sides])
+    x, y, z = np.moveaxis(mesh.vertices[mesh.faces], 2, 0)
+    volume = np.linalg.det(np.stack([x, y, z], axis=-1)).sum() / 6
+    assert volume == pytest.approx(a * b * c)

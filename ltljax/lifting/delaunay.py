@@ -46,7 +46,7 @@ def delaunay_triangulation(
     """
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()
-    flipless = Triangulation(ends, _ring_slots(ring, tails, len(vertices)), (), tails)
+    flipless = Triangulation(ends, _ring_slots(ring, tails, len(vertices)), _in_levels([], len(tails)), tails)
     lengths, angles = flipped(ring_angles(vertices, flipless, ring, ring_blocks), flipless)
     face_of = np.full(len(tails), -1)
     corner = np.flatnonzero(following >= 0)
@@ -60,16 +60,24 @@ def delaunay_triangulation(
             break
         h1, t1 = following[h], following[h ^ 1]
         h2, t2 = following[h1], following[t1]
-        level = Flips(h.astype(np.int32), np.stack([h1, h2, t1, t2]).astype(np.int32))
-        lengths, angles = flip(lengths, angles, level)
-        levels.append(level)
+        levels.append(np.stack([h, h1, h2, t1, t2]))
+        lengths, angles = flip(lengths, angles, h, levels[-1][1:])
         tails[h], tails[h ^ 1] = tails[t2], tails[h2]
         following[h], following[h2], following[t1] = h2, t1, h
         following[h ^ 1], following[t2], following[h1] = t2, h1, h ^ 1
         face_of[t1], face_of[h1] = face_of[h], face_of[h ^ 1]
         candidates = np.union1d(wanting, np.concatenate([h1, h2, t1, t2]) >> 1)
-    triangulation = Triangulation(ends, flipless.slots, tuple(levels), tails.astype(np.int32))
+    triangulation = Triangulation(ends, flipless.slots, _in_levels(levels, len(tails)), tails.astype(np.int32))
     return triangulation, HalfEdges(following, tails, lengths, angles)
+
+
+def _in_levels(levels: list[np.ndarray], fill: int) -> Flips:
+    """The flips of all levels, each (5, N), made equally wide."""
+    width = max((level.shape[1] for level in levels), default=0)
+    padded = np.full((len(levels), 5, width), fill, np.int32)
+    for row, level in zip(padded, levels, strict=True):
+        row[:, : level.shape[1]] = level
+    return Flips(padded[:, 0], padded[:, 1:])
 
 
 def _connectivity(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ and Crane (2019), Navigating intrinsic triangulations, doi:10.1145/3306346.33229
 """
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -28,16 +29,18 @@ _SLACK = 1e-6
 
 
 class Flips(eqx.Module):
-    """Edge flips that do not share a face, so that all of them can be made at once.
+    """Edge flips in levels. Those of one level do not share a face, so that all of them can be made at once.
+
+    Levels are as wide as the widest; what is left of the others is filled with half-edge H, behind the last.
 
     Attributes:
-        flipped: (N,) a half-edge a -> b of each edge. Afterwards it is d -> c and its twin c -> d, with c the apex on
+        flipped: (L, N) a half-edge a -> b of each edge. Afterwards it is d -> c and its twin c -> d, with c the apex on
             its left and d the one on its right.
-        around: (4, N) the half-edges b -> c, c -> a, a -> d and d -> b.
+        around: (L, 4, N) the half-edges b -> c, c -> a, a -> d and d -> b.
     """
 
-    flipped: Int[AnyArray, " N"]
-    around: Int[AnyArray, "4 N"]
+    flipped: Int[AnyArray, "L N"]
+    around: Int[AnyArray, "L 4 N"]
 
 
 class Triangulation(eqx.Module):
@@ -46,13 +49,13 @@ class Triangulation(eqx.Module):
     Attributes:
         ends: (E, 2) the vertices of each edge of the mesh; half-edge 2 e leads from the first to the second.
         slots: (H,) where each half-edge of the mesh stands in the table of one-rings, its blocks laid end to end.
-        levels: the flips, level by level.
+        flips: the flips.
         tails: (H,) the vertex at which each half-edge begins after all flips.
     """
 
     ends: Int[AnyArray, "E 2"]
     slots: Int[AnyArray, " H"]
-    levels: tuple[Flips, ...]
+    flips: Flips
     tails: Int[AnyArray, " H"]
 
 
@@ -157,28 +160,43 @@ def directions(angles: RingAngles, triangulation: Triangulation, kinds: Int[AnyA
 def flipped(angles: RingAngles, triangulation: Triangulation) -> tuple[Float[AnyArray, " E"], Float[AnyArray, " H"]]:
     """After all flips: the length of each edge, and the angle of each half-edge from the first slot of its tail."""
     xp = angles.lengths.__array_namespace__()
+    flips = triangulation.flips
     lengths = angles.lengths
     around = take(xp.concatenate([block.reshape(-1) for block in angles.corners]), triangulation.slots)
-    for level in triangulation.levels:
-        lengths, around = flip(lengths, around, level)
-    return lengths, around
+    if not flips.flipped.shape[0]:
+        return lengths, around
+    # One more edge, of length one, for the places of narrow levels that are not used.
+    one = xp.ones(1, dtype=lengths.dtype)
+    start = xp.concatenate([lengths, one]), xp.concatenate([around, 0 * one, 0 * one])
+    if isinstance(around, np.ndarray):
+        for level in zip(flips.flipped, flips.around, strict=True):
+            start = flip(*start, *level)
+        lengths, around = start
+    else:
+        # A loop, as XLA takes seconds to compile a few levels that follow one another.
+        levels = flips.flipped, flips.around
+        (lengths, around), _ = jax.lax.scan(lambda carry, level: (flip(*carry, *level), None), start, levels)
+    return lengths[:-1], around[:-2]
 
 
 def flip(
-    lengths: Float[AnyArray, " E"], angles: Float[AnyArray, " H"], level: Flips
+    lengths: Float[AnyArray, " E"],
+    angles: Float[AnyArray, " H"],
+    flipped: Int[AnyArray, " N"],
+    around: Int[AnyArray, "4 N"],
 ) -> tuple[Float[AnyArray, " E"], Float[AnyArray, " H"]]:
     """Lengths and angles after the flips of one level: each pair of faces is laid flat and the other diagonal taken."""
     xp = lengths.__array_namespace__()
-    ab, (bc, ca, ad, db) = take(lengths, level.flipped >> 1), take(lengths, level.around >> 1)
+    ab, (bc, ca, ad, db) = take(lengths, flipped >> 1), take(lengths, around >> 1)
     # The quadrilateral with a at the origin, b on the first axis, c above and d below it.
     cx, cy = (ab**2 + ca**2 - bc**2) / (2 * ab), double_area(ab, bc, ca) / ab
     dx, dy = (ab**2 + ad**2 - db**2) / (2 * ab), double_area(ab, ad, db) / ab
     along, down = dx - cx, cy + dy
     at_c = xp.arctan2(cx * down + cy * along, cy * down - cx * along)
     at_d = xp.arctan2((ab - dx) * down + dy * along, dy * down - (ab - dx) * along)
-    lengths = _replace(lengths, level.flipped >> 1, xp.sqrt(along**2 + down**2))
-    angles = _replace(angles, level.flipped, take(angles, level.around[3]) + at_d)
-    return lengths, _replace(angles, level.flipped ^ 1, take(angles, level.around[1]) + at_c)
+    new = take(angles, around[3]) + at_d, take(angles, around[1]) + at_c
+    lengths = _replace(lengths, flipped >> 1, xp.sqrt(along**2 + down**2))
+    return lengths, _replace(_replace(angles, flipped, new[0]), flipped ^ 1, new[1])
 
 
 def double_area(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
@@ -345,10 +363,10 @@ def with_columns(
 
 
 def _replace(values: AnyArray, index: AnyArray, new: AnyArray, axis: int = 0) -> AnyArray:
-    """The values with those at distinct indices along an axis replaced."""
+    """The values with those at some indices along an axis replaced."""
     where = (slice(None),) * axis + (index,)
     if isinstance(values, np.ndarray):
         values = values.copy()
         values[where] = new
         return values
-    return values.at[where].set(new, mode="promise_in_bounds", unique_indices=True, wrap_negative_indices=False)
+    return values.at[where].set(new, mode="promise_in_bounds", wrap_negative_indices=False)

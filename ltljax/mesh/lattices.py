@@ -30,6 +30,18 @@ def grid_faces(num_rows: int, num_columns: int, *, wrap_rows: bool, wrap_columns
     return np.stack([corner, down, across, corner, across, side], axis=-1).reshape(-1, 3)
 
 
+def alternating_faces(num_rows: int, num_columns: int) -> np.ndarray:
+    """The triangles of a lattice whose vertex (i, j) is ``i * num_columns + j``, neighbouring quads cut crosswise.
+
+    Each turns from the direction of the rows' index to that of the columns'.
+    """
+    faces = grid_faces(num_rows, num_columns, wrap_rows=False, wrap_columns=False).reshape(-1, 6)
+    corner, down, across, _, _, side = faces.T
+    other = np.stack([corner, down, side, down, across, side], axis=1)
+    is_odd = np.indices((num_rows - 1, num_columns - 1)).sum(axis=0).reshape(-1, 1) % 2 == 1
+    return np.where(is_odd, other, faces).reshape(-1, 3)
+
+
 def torus_points(x: np.ndarray, y: np.ndarray, major: float | int, minor: float | int) -> tuple[np.ndarray, np.ndarray]:
     """Positions and unit normals, (V, 3) each, of a torus at angles x around the tube and y around the axis, (V,)."""
     major, minor = positive("major", major), positive("minor", minor)

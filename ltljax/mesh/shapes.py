@@ -8,10 +8,11 @@ import numpy as np
 
 from .arguments import at_least, positive
 from .irregular import jittered, jittered_sphere, jittered_torus, random_sphere
-from .lattices import disk_lattice, grid_faces, icosahedral_lattice, torus_points
+from .lattices import alternating_faces, disk_lattice, grid_faces, icosahedral_lattice, torus_points
 from .mesh import Mesh
 
 __all__ = [
+    "box",
     "cylinder",
     "disk",
     "ellipsoid",
@@ -140,3 +141,28 @@ def cylinder(radius: float | int = 1.0, height: float | int = 2.0, n_around: int
     vertices = positive("radius", radius) * normals
     vertices[:, 2] = z
     return Mesh(vertices, grid_faces(n_around, n_along + 1, wrap_rows=True, wrap_columns=False), normals=normals)
+
+
+def box(sides: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), n: int = 16) -> Mesh:
+    """The surface of the box [0, a] x [0, b] x [0, c], of nearly square cells whose diagonals alternate.
+
+    Args:
+        sides: the lengths a, b, c of the sides.
+        n: cells along the longest side, at least 2; the others have as many as make their cells as long, at least 2.
+    """
+    if np.shape(sides) != (3,):
+        raise ValueError(f"sides must be three lengths such as (1.0, 1.0, 2.0), found the shape {np.shape(sides)}.")
+    n, lengths = at_least("n", n, 2), np.array([positive("each of the sides", side) for side in sides])
+    counts = np.maximum(np.round(n * lengths / lengths.max()).astype(int), 2)
+    vertices, faces, start = [], [], 0
+    for axis in range(3):
+        rows, columns = counts[(axis + 1) % 3], counts[(axis + 2) % 3]
+        lattice = np.indices((rows + 1, columns + 1)).reshape(2, -1)
+        upwards = alternating_faces(rows + 1, columns + 1)
+        for level, sheet in ((0, upwards[:, ::-1]), (counts[axis], upwards)):
+            place = np.empty((lattice.shape[1], 3))
+            place[:, axis], place[:, (axis + 1) % 3], place[:, (axis + 2) % 3] = level, *lattice
+            vertices.append(place)
+            faces.append(sheet + start)
+            start += len(place)
+    return Mesh(np.concatenate(vertices) / counts * lengths, np.concatenate(faces), weld=True)
