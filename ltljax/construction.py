@@ -15,11 +15,11 @@ from .lifting import support
 from .lifting.charts import Charts, Neighbourhood
 from .lifting.delaunay import HalfEdges, delaunay_triangulation, opposite_edges
 from .lifting.frames import tangent_frames
-from .lifting.intrinsic import CotangentRows, Directions, RingAngles, directions, ring_angles
+from .lifting.intrinsic import CotangentRows, Directions, RingAngles, directions
 from .lifting.jets import INTERIOR, LAPLACIAN, OTHER_CORNER, RIGHT_CORNER, SMOOTH
-from .lifting.layout import Places, block_paths, offsets
+from .lifting.layout import Places, block_paths
 from .lifting.paper import dropped_faces
-from .lifting.ring import RingTopology, angle_sums, lifted_ring
+from .lifting.ring import RingTopology, angle_sums, lifted_ring, offsets
 from .lifting.schemes import (
     Monotone,
     Paper,
@@ -40,7 +40,7 @@ from .tables import Table, build_table, reversible
 # right angle it counts as one.
 _CORNER, _RIGHT = 40, 20
 # An edge is a crease where its two faces turn from one another by more than this many degrees. No height fit crosses a
-# crease: this decides normals, and where `Polynomial` fits in charts, and nothing else.
+# crease: this affects normals, `hodge_laplacian`, `crease_mean`, and where `Polynomial` uses charts.
 CREASE = 40
 # The normal of a face with an angle beyond this says little about the surface, and its edges are no creases.
 _FLATTEST = 150
@@ -64,8 +64,8 @@ class SurfaceReport:
             no part in the mean; else None.
         wide_gradient_rows: vertices whose one-ring (for `Polynomial`, whose nearest neighbours) does not determine the
             fit, so that the gradient uses more; None for `Paper`.
-        undetermined: vertices where no choice of neighbours determines the fit. The gradient there is not of its order,
-            and for `Polynomial` neither is the Laplacian.
+        undetermined: vertices where no choice of neighbours determines the fit. The gradient loses its order there, and
+            for `Polynomial` so does the Laplacian.
         rings: (V,) for `Monotone`, the number of rings each Laplacian row was chosen from; else None.
         residual: (V,) for `Monotone`, the relative moment residual of each Laplacian row; else None.
         cotangent: vertices whose Laplacian row is the cotangent row of the intrinsic Delaunay triangulation: those
@@ -206,9 +206,7 @@ def _choose_neighbours(
     topology, chart = _lay_charts(mesh, topology, scheme, is_folded, on_crease)
 
     laps.end("charts")
-    chart_directions, charts, angles = (
-        (None, None, None) if chart is None else (chart.directions, chart.charts, chart.angles)
-    )
+    chart_directions, charts = (None, None) if chart is None else (chart.directions, chart.charts)
     around = Places(vertices, normals, tangent_frames(normals), chart_directions, "projection")
     first = reach_along(rings, around, charts, topology.is_extrinsic)
     one_ring = support.Rows.all_of(first(np.arange(mesh.num_vertices), 1))
@@ -234,10 +232,12 @@ def _choose_neighbours(
     if isinstance(scheme, Polynomial):
         return dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths), report
 
-    # The Laplacian's rows are chosen in the frames they will be weighed in.
-    normals = surface_normals(scheme, vertices, topology)
-    frames, _ = vertex_frames(vertices, normals, topology, angles)
-    places = places_in(scheme, vertices, normals, frames, chart_directions)
+    places = around
+    if chart is None or topology.is_extrinsic is not None:
+        # Rows in space are chosen in the tangent planes they will be weighed in.
+        normals = surface_normals(scheme, vertices, topology)
+        frames, _ = vertex_frames(vertices, normals, topology)
+        places = places_in(scheme, vertices, normals, frames, chart_directions)
     topology, report = _choose_diffusion(
         scheme,
         topology,
@@ -264,7 +264,7 @@ def _choose_diffusion(
     around = reach(np.arange(len(topology.kinds)), 1)
     one_ring = support.Rows.all_of(around)
     narrow = dataclasses.replace(topology, **_table_of("diffusion", one_ring, topology, chart))
-    _, residual, _ = diffusion_rows(scheme, places, narrow)
+    _, residual, _, _ = diffusion_rows(scheme, places, narrow)
     is_good = residual <= support.CONSISTENT
     is_cotangent = np.zeros(len(is_good), bool)
     if chart is not None:
@@ -312,8 +312,9 @@ def _lay_charts(
     chart: all rows of the intrinsic `Monotone` but those at folded faces, and of `Polynomial` those at creases."""
     if on_crease is None or (isinstance(scheme, Polynomial) and not on_crease.any()):
         return topology, None
-    triangulation, half_edges = delaunay_triangulation(mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks)
-    angles = ring_angles(mesh.vertices, triangulation, topology.ring, topology.ring_blocks)
+    triangulation, half_edges, angles = delaunay_triangulation(
+        mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks
+    )
     chart_directions = directions(angles, triangulation, topology.kinds)
     charts = Charts(
         triangulation.tails, topology.kinds, chart_directions, is_folded, support.LARGEST_FIT[scheme.degree]
@@ -330,7 +331,7 @@ def _singular_corners(kinds: np.ndarray, angle_sums: np.ndarray, one_ring: suppo
     """The corners of the boundary near which fields without flux are not smooth, (V,).
 
     At an obtuse corner such fields have no second derivatives, at a re-entrant one not even a gradient, so that no row
-    can be consistent with them; nor with what is left of them at a corner beside one.
+    can be consistent with them. The same holds at a corner next to such a corner.
     """
     is_corner, is_right = kinds >= RIGHT_CORNER, kinds == RIGHT_CORNER
     is_singular = is_corner & (angle_sums > np.where(is_right, np.pi, np.pi / 2))
@@ -338,7 +339,7 @@ def _singular_corners(kinds: np.ndarray, angle_sums: np.ndarray, one_ring: suppo
 
 
 def _is_uneven(around: Neighbourhood) -> np.ndarray:
-    """Which vertices have neighbours so much nearer than others that a fit is lost in rounding, (V,)."""
+    """Which vertices have edges whose ratio of lengths is too large to fit in double precision, (V,)."""
     squared = np.sum(around.lifted**2, axis=1)
     shortest, longest = (reduce.reduceat(squared, around.offsets[:-1]) for reduce in (np.minimum, np.maximum))
     return shortest * _LARGEST_RATIO**2 < longest

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 
 from .construction import CREASE
 from .lifting.jets import INTERIOR
-from .lifting.layout import offsets
-from .lifting.ring import RingTopology, angle_sums, take_slots
+from .lifting.ring import RingTopology, angle_sums, offsets, take_slots
 from .operators import second_derivatives
 from .surface import Surface
 from .tables import AnyArray, Block

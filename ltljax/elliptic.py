@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .construction import charts_of, reach_along
 from .lifting import support
-from .lifting.intrinsic import Paths
+from .lifting.intrinsic import CotangentRows, Paths, cotangent_weights, with_columns
 from .lifting.jets import operator_weights
 from .lifting.layout import PerBlock, Places, block_paths, rows_last
 from .lifting.schemes import Topology, places
@@ -30,6 +30,7 @@ from .tables import (
     reverse_weights,
     reversible,
     slot_sum,
+    slot_values,
 )
 
 # Where not every condition can be met the drift is to be exact, and the excess of diffusion the least.
@@ -42,6 +43,7 @@ class EllipticStencil(eqx.Module):
     Attributes:
         table: the neighbours.
         paths: for each block the half-edges that lead to them; None where all rows are laid out in space.
+        cotangent_rows: for each block the rows that are those of the cotangent Laplacian times half the trace of D.
         weights: one array (K, N) per block of the table, non-negative.
         reverse: the same weights in the order of the table's reverse, for derivatives in reverse mode.
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
@@ -50,6 +52,7 @@ class EllipticStencil(eqx.Module):
 
     table: Table
     paths: tuple[Paths, ...] | None
+    cotangent_rows: tuple[CotangentRows, ...] | None
     weights: PerBlock
     reverse: ReverseWeights | None
     residual: Float[AnyArray, " V"]
@@ -76,10 +79,10 @@ class EllipticStencil(eqx.Module):
         """
         targets = _targets(surface.geometry.frames, diffusion, drift)
         around = places(surface.scheme, surface.geometry)
-        weights, residual = _rows(around, surface.topology.kinds, targets, self.table, self.paths)
+        weights, residual = _rows(around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows)
         found = (weights, reverse_weights(self.table, weights), residual, _mean_diffusion(targets))
         weights, reverse, residual, mean = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, self.paths, weights, reverse, residual, mean)
+        return EllipticStencil(self.table, self.paths, self.cotangent_rows, weights, reverse, residual, mean)
 
 
 def elliptic_stencil(
@@ -96,6 +99,9 @@ def elliptic_stencil(
     upwind. Where D is so anisotropic that three rings hold no consistent row, the row of least error is taken. Both
     show in the residual. Such an operator has a maximum principle and no growing modes. On a boundary it is for fields
     whose normal derivative vanishes.
+
+    Where the Laplacian has a cotangent row (see `SurfaceReport`), so has an isotropic operator without drift: D times
+    that row. Other operators have no row of that kind, and where none is consistent the residual says so.
 
     For the divergence form div(D grad u) add the divergence of D to the drift; for a scalar D see `weighted_laplacian`.
 
@@ -124,12 +130,14 @@ def elliptic_stencil(
         topology.is_extrinsic,
     )
     rows = support.Rows.all_of(reach(np.arange(surface.num_vertices), 1))
-    _, residual = _rows(around, kinds, targets, *_table(rows, topology, around))
+    _, residual = _rows(around, kinds, targets, *_table(rows, topology, around), None)
+    # Where the Laplacian has a cotangent row, so has an isotropic operator without drift.
+    is_cotangent = _is_isotropic(targets) & _cotangent_vertices(topology)
     # Where some row meets every condition there is nothing to emphasise.
     for emphasis in (1.0, _EMPHASIS):
         rows, record = support.nonnegative_support(
             rows,
-            residual <= support.CONSISTENT,
+            (residual <= support.CONSISTENT) | is_cotangent,
             kinds,
             targets[0],
             reach,
@@ -137,13 +145,14 @@ def elliptic_stencil(
             emphasis,
         )
         residual = record.residual
+    rows, cotangent_rows = _with_cotangent_rows(rows, topology, is_cotangent)
     table, paths = _table(rows, topology, around)
     table = reversible(table)
-    weights, residual = _rows(around, kinds, targets, table, paths)
+    weights, residual = _rows(around, kinds, targets, table, paths, cotangent_rows)
     found = (weights, reverse_weights(table, weights), residual, _mean_diffusion(targets))
     weights, reverse, residual, mean = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
-    table, paths = jax.tree.map(jnp.asarray, (table, paths))
-    return EllipticStencil(table, paths, weights, reverse, residual, mean)
+    table, paths, cotangent_rows = jax.tree.map(jnp.asarray, (table, paths, cotangent_rows))
+    return EllipticStencil(table, paths, cotangent_rows, weights, reverse, residual, mean)
 
 
 def direction_tensor(
@@ -233,7 +242,12 @@ def _table(rows: support.Rows, topology: Topology, around: Places) -> tuple[Tabl
 
 
 def _rows(
-    around: Places, kinds: AnyArray, targets: AnyArray, table: Table, paths: tuple[Paths, ...] | None
+    around: Places,
+    kinds: AnyArray,
+    targets: AnyArray,
+    table: Table,
+    paths: tuple[Paths, ...] | None,
+    cotangent_rows: tuple[CotangentRows, ...] | None,
 ) -> tuple[PerBlock, AnyArray]:
     """The weights on the neighbours, and the residual of every row."""
 
@@ -244,4 +258,63 @@ def _rows(
         return c[0], residual[0]
 
     weights, residuals = zip(*table.each(rows, rows_last(around.lifted(table, paths))), strict=True)
+    if cotangent_rows is None or around.directions is None:
+        return weights, table.rows_from(list(residuals))
+    blocks = []
+    half_trace = (targets[0, 3] + targets[0, 4]) / 4
+    for block, row, weight, residual in zip(table.blocks, cotangent_rows, weights, residuals, strict=True):
+        cotangent, area = cotangent_weights(around.directions, row)
+        scaled = cotangent * block.part(row.columns).centre(half_trace)[None]
+        exact = with_columns(residual[None], row.columns, 0 * area[None])[0]
+        blocks.append((with_columns(weight, row.columns, scaled), exact))
+    weights, residuals = zip(*blocks, strict=True)
     return weights, table.rows_from(list(residuals))
+
+
+def _is_isotropic(targets: np.ndarray) -> np.ndarray:
+    """Where the operator is a multiple of the Laplacian, (V,)."""
+    x, y, xy, xx, yy = np.abs(targets[0])
+    small = 1e-12 * (xx + yy)
+    return (x <= small) & (y <= small) & (xy <= small) & (np.abs(targets[0, 3] - targets[0, 4]) <= small)
+
+
+def _cotangent_vertices(topology: Topology) -> np.ndarray:
+    """The vertices whose Laplacian row is a cotangent row, (V,)."""
+    is_cotangent = np.zeros(len(topology.kinds), bool)
+    if topology.cotangent_rows is not None and topology.diffusion is not None:
+        for block, rows in zip(topology.diffusion.blocks, topology.cotangent_rows, strict=True):
+            is_cotangent[block.part(rows.columns).centre(np.arange(len(is_cotangent)))] = True
+    return is_cotangent
+
+
+def _with_cotangent_rows(
+    rows: support.Rows, topology: Topology, which: np.ndarray
+) -> tuple[support.Rows, tuple[CotangentRows, ...] | None]:
+    """The rows with those of the marked vertices replaced by the Laplacian's cotangent rows (host)."""
+    if topology.cotangent_rows is None or topology.diffusion is None or topology.diffusion_paths is None:
+        return rows, None
+    none = len(topology.triangulation.ends) if topology.triangulation is not None else 0
+    owners, members, paths = [], [], []
+    for block, laid, row in zip(
+        topology.diffusion.blocks, topology.diffusion_paths, topology.cotangent_rows, strict=True
+    ):
+        part = block.part(row.columns)
+        own = np.broadcast_to(part.centre(np.arange(len(which))), part.indices.shape)
+        used = (part.indices != own) & which[own]
+        path = np.full((used.sum(), rows.paths.shape[1]), 2 * none)
+        path[:, 0] = laid.first[:, row.columns][used]
+        owners.append(own[used])
+        members.append(part.indices[used])
+        # The edges of the cotangents travel beside the paths.
+        paths.append(np.concatenate([path, row.edges[:, used].T], axis=1))
+    wide = support.Rows(
+        rows.offsets, rows.members, np.concatenate([rows.paths, np.full((len(rows.members), 5), none)], axis=1)
+    )
+    entries = (np.concatenate(parts) for parts in (owners, members, paths))
+    wide = wide.replaced(*entries, which=np.flatnonzero(which))
+    edges = zip(*(slot_values(wide.offsets, column, none) for column in wide.paths[:, -5:].T), strict=True)
+    blocks = []
+    for block in edges:
+        columns = np.flatnonzero((block[0] != none).any(axis=0))
+        blocks.append(CotangentRows(columns.astype(np.int32), np.stack(block)[:, :, columns].astype(np.int32)))
+    return support.Rows(wide.offsets, wide.members, wide.paths[:, :-5]), tuple(blocks)

@@ -63,8 +63,8 @@ class Surface(eqx.Module):
                 so small that its weights leave the range of the dtype.
 
         Warns:
-            InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row, or `Polynomial`
-                no neighbours that determine its fit.
+            InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row and could not use
+                the cotangent row, or `Polynomial` found no neighbours that determine its fit.
         """
         if not isinstance(mesh, Mesh):
             raise TypeError(
@@ -94,10 +94,11 @@ class Surface(eqx.Module):
         return cls(topology, geometry, scheme, report)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
-        """The surface with its vertices moved and every weight computed anew, on the same support.
+        """The surface with its vertices moved and every weight recomputed, on the same support.
 
-        Pure, differentiable in the vertices and jit-compiled; the host is not asked. The support is the one chosen for
-        the mesh it was built from: after a large deformation build the surface anew.
+        Pure, differentiable in the vertices and jit-compiled, without work on the host. The support, with the flips of
+        the intrinsic triangulation, is the one chosen for the mesh it was built from: after a large deformation build a
+        new surface. In float32, rows whose edges differ in length by more than a thousand times lose their accuracy.
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")

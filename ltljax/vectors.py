@@ -172,8 +172,10 @@ def vector_laplacian(
     Raises:
         ValueError: the scheme is `Paper`, or X does not fit the surface.
 
-    Source: the parallel transport L of Chen, Chi and Wu, arXiv 0907.1817, section 2, between refined normals; the
-    weights as of `laplacian`.
+    Transport is that of the charts where rows are laid out in them, as by default, and else the shortest rotation
+    between the normals; both are of the order of the paper's transport along edges, which `Paper` has.
+
+    Source: Chen, Chi and Wu, arXiv 0907.1817, section 2, for the idea; the weights as of `laplacian`.
     """
     along = connection(surface) if along is None else along
     return from_frame(surface, along(to_frame(surface, X)))
@@ -183,8 +185,8 @@ def vector_laplacian(
 def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """grad div X + n x grad curl X, the Laplacian that takes the gradient of u to that of Delta u; sign as `laplacian`.
 
-    By Weitzenboeck's formula the vector Laplacian less K X, K the Gauss curvature: the fitted one, but beside a crease
-    the angle defect over the vertex area. Pointwise first order.
+    By Weitzenboeck's formula the vector Laplacian less K X, where K is the Gauss curvature. K is fitted, except near
+    creases, where it is the angle defect over the vertex area. Pointwise first order.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -252,8 +254,9 @@ def transport_along(
 ) -> Float[Array, "n *S 3"]:
     """A tangent vector carried along a path of vertices by parallel transport: the vector at each of them.
 
-    Lengths and angles stay. Around a closed path the vector comes back turned, to the left by the integral of the Gauss
-    curvature to the left of the path: its area on the unit sphere, to second order.
+    From vertex to vertex by the shortest rotation between the normals. Lengths and angles stay. Around a closed path
+    the vector comes back turned, to the left by the integral of the Gauss curvature to the left of the path: its area
+    on the unit sphere, to second order.
 
     Args:
         surface: the surface.
@@ -263,7 +266,6 @@ def transport_along(
     Raises:
         ValueError: the vector has another shape, or the path leaves the surface.
 
-    Source: the parallel transport L of Chen, Chi and Wu, arXiv 0907.1817, section 2.
     """
     vector = jnp.asarray(vector, surface.dtype)
     if vector.ndim not in (1, 2) or vector.shape[-1] != 3:
@@ -302,6 +304,8 @@ def singularities(surface: Surface, X: Float[AnyArray, "V 3"], symmetry: int = 1
         surface: the surface.
         X: (V, 3), one arm of the field at every vertex, nowhere zero.
         symmetry: how many arms it has: 1 for vectors, 2 for lines, 4 for crosses.
+
+    The field is compared along the edges of the mesh by the shortest rotation between the normals.
 
     Source: Knoppel, Crane, Pinkall and Schroder (2013), Globally optimal direction fields,
     doi:10.1145/2461912.2462005, section 6.

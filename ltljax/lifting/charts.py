@@ -75,7 +75,7 @@ class Charts:
         self.longest_path = longest_path
 
     def around(self, vertices: np.ndarray, rings: int) -> Neighbourhood:
-        """All vertices within so many edges of each of the given ones.
+        """All vertices within ``rings`` edges of each of the given ones.
 
         Of several paths to a neighbour those with the fewest edges count, and among these the one that is the
         straightest and passes the least curvature.
@@ -107,14 +107,14 @@ class Charts:
             known = np.sort(np.concatenate([known, key[order]]))
             reached.append((owner, at, np.stack([place.real, place.imag], axis=1), path))
             goes_on = self._is_open[at]
-            # A vertex among sharp cones only has no other way.
+            # If every neighbour is blocked, allow paths through all of them.
             goes_on |= np.bincount(owner, goes_on, minlength=len(vertices))[owner] == 0
             owner, at, place, turn, path = owner[goes_on], at[goes_on], place[goes_on], turn[goes_on], path[goes_on]
         owners, members, lifted, paths = map(np.concatenate, zip(*reached, strict=True))
         return Neighbourhood.gather(owners, len(vertices), members.astype(np.int32), lifted, paths)
 
     def edges(self, vertices: np.ndarray) -> Neighbourhood:
-        """All edges at each of the given vertices but those that return to it: a neighbour may stand there twice."""
+        """All edges at each of the given vertices except self-loops. A neighbour may appear twice."""
         owner, half_edge = self._leaving(np.asarray(vertices, np.int64))
         keep = self._heads[half_edge] != np.asarray(vertices)[owner]
         owner, half_edge = owner[keep], half_edge[keep]

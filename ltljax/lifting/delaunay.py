@@ -1,7 +1,7 @@
 """Which flips make a triangulation intrinsically Delaunay: chosen once, on the host, from the positions.
 
 What enters: the faces, the table of one-rings and the positions. What leaves: the flips that lead to the intrinsic
-Delaunay triangulation, and how its half-edges hang together (`HalfEdges`).
+Delaunay triangulation, and the connectivity of its half-edges (`HalfEdges`).
 
 Source: Bobenko and Springborn (2007), A discrete Laplace-Beltrami operator for simplicial surfaces,
 doi:10.1007/s00454-007-9006-1.
@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from ..tables import Table
-from .intrinsic import Flips, Triangulation, corner_angle, flip, flipped, ring_angles
+from .intrinsic import Flips, RingAngles, Triangulation, corner_angle, flip, flipped, ring_angles
 from .ring import RingTopology
 
 # Two angles opposite an edge may exceed pi by this much: the diagonals of a square tie, and rounding decides nothing.
@@ -38,8 +38,8 @@ class HalfEdges:
 
 def delaunay_triangulation(
     faces: np.ndarray, vertices: np.ndarray, ring: Table, ring_blocks: tuple[RingTopology, ...]
-) -> tuple[Triangulation, HalfEdges]:
-    """The intrinsic Delaunay triangulation of a mesh, and its half-edges.
+) -> tuple[Triangulation, HalfEdges, RingAngles]:
+    """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
 
     Every round flips a set of edges that do not share a face, those first whose opposite angles exceed pi the most, and
     looks again at the edges around them.
@@ -47,7 +47,8 @@ def delaunay_triangulation(
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()
     flipless = Triangulation(ends, _ring_slots(ring, tails, len(vertices)), _in_levels([], len(tails)), tails)
-    lengths, angles = flipped(ring_angles(vertices, flipless, ring, ring_blocks), flipless)
+    mesh_angles = ring_angles(vertices, flipless, ring, ring_blocks)
+    lengths, angles = flipped(mesh_angles, flipless)
     face_of = np.full(len(tails), -1)
     corner = np.flatnonzero(following >= 0)
     face_of[corner] = np.minimum(corner, np.minimum(following[corner], following[following[corner]]))
@@ -68,7 +69,7 @@ def delaunay_triangulation(
         face_of[t1], face_of[h1] = face_of[h], face_of[h ^ 1]
         candidates = np.union1d(wanting, np.concatenate([h1, h2, t1, t2]) >> 1)
     triangulation = Triangulation(ends, flipless.slots, _in_levels(levels, len(tails)), tails.astype(np.int32))
-    return triangulation, HalfEdges(following, tails, lengths, angles)
+    return triangulation, HalfEdges(following, tails, lengths, angles), mesh_angles
 
 
 def _in_levels(levels: list[np.ndarray], fill: int) -> Flips:

@@ -64,10 +64,10 @@ def corner_conormals(
 def transport(
     source: Float[AnyArray, "*#N 3"], target: Float[AnyArray, "*#N 3"], vectors: Float[AnyArray, "*#N 3"]
 ) -> Float[AnyArray, "*#N 3"]:
-    """Parallel transport L of tangent vectors from the plane of normal ``source`` to the plane of normal ``target``.
+    """Transport of tangent vectors from the plane of normal ``source`` to the plane of normal ``target``.
 
-    The shortest rotation that takes one normal to the other (Chen, Chi and Wu, arXiv 0907.1817, section 2). For X
-    tangent at the source it is X - (t.X) / (1 + s.t) (s + t).
+    By the shortest rotation that takes one normal to the other: for X tangent at the source it is
+    X - (t.X) / (1 + s.t) (s + t). The transport of the paper goes along an edge instead: see `layout.Places`.
     """
     xp = vectors.__array_namespace__()
     cosine = xp.sum(source * target, axis=-1, keepdims=True)

@@ -20,10 +20,10 @@ from jaxtyping import Float, Int
 from ..tables import AnyArray, Block, Table, take
 from .frames import transport, unit
 from .jets import INTERIOR, RIGHT_CORNER
-from .ring import RingTopology, take_slots
+from .ring import RingTopology, offsets, take_slots
 
-# Where a face is so flat that one side is longer than the other two less this share of the mean edge, every edge is
-# lengthened by what is missing (Sharp and Crane 2020, A Laplacian for nonmanifold triangle meshes,
+# If a face violates the triangle inequality up to a slack of this fraction of its shortest edge, all edges are
+# lengthened by the same amount until it holds (Sharp and Crane 2020, A Laplacian for nonmanifold triangle meshes,
 # doi:10.1111/cgf.14069, section 4.5).
 _SLACK = 1e-6
 
@@ -85,7 +85,7 @@ class Paths(eqx.Module):
     Attributes:
         first: (K, N) the first half-edge of every slot.
         columns: (n,) the columns of the block with neighbours beyond the one-ring.
-        further: (R, K, n) the half-edges that follow in those columns, of length zero where a path has ended.
+        further: (R, K, n) the half-edges that follow in those columns, padded with the half-edge of length zero.
         in_space: (m,) the columns of the block whose neighbours are laid out in space instead.
     """
 
@@ -102,8 +102,8 @@ class RingAngles(eqx.Module):
         lengths: (E,) the lengths of the edges.
         corners: for each block of the one-rings the angle (K, N) of each slot from the first one.
         sums: (V,) the sum of the angles of the faces at each vertex.
-        first: (V,) the direction of the first slot in a chart whose second axis is the outward conormal, at the
-            vertices of a smooth boundary, whose tangent is that of the parabola through three vertices.
+        first: (V,) the direction of the first slot at vertices of a smooth boundary. The second axis of their chart is
+            the outward conormal, from the parabola through three boundary vertices.
     """
 
     lengths: Float[AnyArray, " E"]
@@ -119,9 +119,8 @@ def ring_angles(
     xp = vertices.__array_namespace__()
     ends = triangulation.ends
     lengths = xp.sqrt(xp.sum((take(vertices, ends[:, 1]) - take(vertices, ends[:, 0])) ** 2, axis=-1))
-    required = _SLACK * xp.mean(lengths)
-    slack = [xp.min(block) for block in ring.each(lambda *a: _slack(*_sides(vertices, *a)), ring_blocks)]
-    added = xp.maximum(required - xp.min(xp.stack(slack)), 0)
+    missing = [xp.max(block) for block in ring.each(lambda *a: _missing(*_sides(vertices, *a)), ring_blocks)]
+    added = xp.maximum(xp.max(xp.stack(missing)), 0)
 
     def around(block, topology):
         has_face, ahead, behind, across = _sides(vertices, block, topology)
@@ -202,9 +201,12 @@ def flip(
 def double_area(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
     """Twice the area of triangles with sides a, b and c (Heron); zero, with zero derivative, where there is none."""
     xp = a.__array_namespace__()
-    product = (a + b + c) * (b + c - a) * (a + c - b) * (a + b - c)
+    total = a + b + c
+    size = xp.where(total > 0, total, 1)
+    # Over the perimeter, so that no power of a length leaves the range of the float type.
+    product = ((b + c - a) / size) * ((a + c - b) / size) * ((a + b - c) / size)
     has_area = product > 0
-    return xp.where(has_area, xp.sqrt(xp.where(has_area, product, 1)), 0) / 2
+    return xp.where(has_area, size * size * xp.sqrt(xp.where(has_area, product, 1)), 0) / 2
 
 
 def corner_angle(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
@@ -215,9 +217,8 @@ def corner_angle(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
 def lay_out(directions: Directions, paths: Paths) -> tuple[Float[AnyArray, "K N 2"], Float[AnyArray, "K N"]]:
     """The neighbours of a block's rows in the charts of their vertices, and the angles that turn their vectors.
 
-    A path is laid out half-edge by half-edge: its next one stands in the chart of the vertex it begins at, which
-    parallel transport along the path so far has turned by the second result. Exact where the path and the straight
-    line to its end enclose no curvature.
+    The direction of each half-edge of a path is given in the chart of its tail. The angle accumulated so far rotates it
+    into the chart of the row's vertex. Exact where the path and the straight line to its end enclose no curvature.
     """
     xp = directions.angles.__array_namespace__()
     none = xp.zeros(paths.first.shape, dtype=directions.angles.dtype)
@@ -242,7 +243,7 @@ def _step(directions, lifted, turn, half_edges):
 def edge_turn(directions: Directions, half_edges: Int[AnyArray, "*N"]) -> Float[AnyArray, "*N"]:
     """The angle by which parallel transport from the head of a half-edge to its tail turns components in the charts.
 
-    An edge leaves its tail in the direction in which it goes on at its head, opposite to its twin's.
+    Transport along an edge preserves its direction: outgoing at the tail, opposite to the twin's at the head.
     """
     return take(directions.angles, half_edges) + np.pi - take(directions.angles, half_edges ^ 1)
 
@@ -260,12 +261,15 @@ class CotangentRows(eqx.Module):
     edges: Int[AnyArray, "5 K n"]
 
 
-def cotangent_weights(directions: Directions, rows: CotangentRows) -> Float[AnyArray, "K n"]:
-    """Rows of the cotangent Laplacian, over the area of the circumcentric dual cell.
+def cotangent_weights(
+    directions: Directions, rows: CotangentRows
+) -> tuple[Float[AnyArray, "K n"], Float[AnyArray, " n"]]:
+    """Rows of the cotangent Laplacian over the areas A of the circumcentric dual cells, and these areas.
 
     With w = (cot alpha + cot beta) / 2 the weights are w / A with A the sum of w l^2 / 4. In a Delaunay triangulation
-    none is negative, and inside ``sum c p = 0`` and ``sum c |p|^2 = 4`` hold in the chart before it is scaled; the row
-    converges in the weak sense only. After moving the vertices, negative weights are cut off.
+    they are non-negative inside, where ``sum c p = 0`` and ``sum c |p|^2 = 4`` hold before chart angles are rescaled.
+    The row converges only in the weak sense. Negative weights, which boundary edges opposite an obtuse angle have and
+    others may have after the vertices have moved, are clipped to zero.
 
     Source: Bobenko and Springborn (2007), A discrete Laplace-Beltrami operator for simplicial surfaces,
     doi:10.1007/s00454-007-9006-1.
@@ -280,14 +284,8 @@ def cotangent_weights(directions: Directions, rows: CotangentRows) -> Float[AnyA
 
     w = xp.maximum(cotangent(*others[:2]) + cotangent(*others[2:]), 0) / 2
     area = xp.sum(w * own**2, axis=0) / 4
-    return w / xp.where(area > 0, area, 1)[None]
-
-
-def replace_rows(
-    weights: Float[AnyArray, "K N"], rows: CotangentRows, directions: Directions
-) -> Float[AnyArray, "K N"]:
-    """The weights of a block with the cotangent rows in their places."""
-    return with_columns(weights, rows.columns, cotangent_weights(directions, rows))
+    area = xp.where(area > 0, area, 1)
+    return w / area[None], area
 
 
 def boundary_conormals(
@@ -309,7 +307,7 @@ def aligned_frames(
     corners: Float[AnyArray, "K N"],
     sums: Float[AnyArray, " N"],
 ) -> Float[AnyArray, "N 2 3"]:
-    """Frames turned in their planes so that the ring in space is as near as can be to the ring in the chart.
+    """Frames rotated in their planes to bring the ring in space as close as possible to the ring in the chart.
 
     Every face is turned into the tangent plane by the shortest rotation, which is exact beside a crease.
     """
@@ -337,7 +335,7 @@ def _sides(vertices, block: Block, topology: RingTopology):
     """For every slot of the one-rings: whether a face follows, the lengths of the edges to the slot's neighbour and to
     the next one, and of the edge between these."""
     xp = vertices.__array_namespace__()
-    seen = xp.where(block.is_used[..., None], block.neighbours(vertices) - block.centre(vertices)[None], 0)
+    seen = offsets(vertices, block)
     following = topology.following(seen.shape[0])
     has_face = following != xp.arange(seen.shape[0], dtype=following.dtype)[:, None]
     after = take_slots(seen, following)
@@ -350,9 +348,11 @@ def _sides(vertices, block: Block, topology: RingTopology):
     return has_face, norm(seen, block.is_used), norm(after, has_face), norm(after - seen, has_face)
 
 
-def _slack(has_face, ahead, behind, across):
-    """By how much the path through each corner is longer than the side opposite; infinite where no face follows."""
-    return ahead.__array_namespace__().where(has_face, ahead + behind - across, np.inf)
+def _missing(has_face, ahead, behind, across):
+    """By how much each corner falls short of the slack of the triangle inequality; minus infinity without a face."""
+    xp = ahead.__array_namespace__()
+    shortest = xp.minimum(xp.minimum(ahead, behind), across)
+    return xp.where(has_face, _SLACK * shortest - (ahead + behind - across), -np.inf)
 
 
 def with_columns(

@@ -7,7 +7,8 @@ Rows are laid out in one of two ways: by edge lengths alone in the chart of the 
 tangent plane (`ring`). The first is the default; the second serves the other lifts, and faces that are folded over.
 """
 
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from ..tables import AnyArray, Block, Table, slot_values
 from .frames import transport
 from .intrinsic import Directions, Paths, lay_out, with_columns
-from .ring import Lift, lifted_ring
+from .ring import Lift, lifted_ring, offsets
 
 PerBlock = tuple[AnyArray, ...]
 
@@ -30,7 +31,9 @@ class Places(eqx.Module):
         frames: (V, 2, 3) tangent frames, turned like the charts.
         directions: lengths and directions in the charts; None where all rows are laid out in space.
         lift: how rows in space are laid into tangent planes.
-        transport: how rows in space turn vectors: by the shortest rotation between the normals, or as in the paper.
+        transport: how rows in space turn vectors. "shortest" rotates one normal to the other; "paper" takes the edge
+            projected to one tangent plane to the same edge projected to the other (Chen, Chi and Wu, arXiv 0907.1817,
+            section 2).
     """
 
     vertices: Float[AnyArray, "V 3"]
@@ -58,14 +61,23 @@ class Places(eqx.Module):
 
         return self._each(table, paths, self._turns_in_space, in_chart)
 
-    def _each(self, table: Table, paths: tuple[Paths, ...] | None, in_space: Any, in_chart: Any) -> PerBlock:
+    def _each(
+        self,
+        table: Table,
+        paths: tuple[Paths, ...] | None,
+        in_space: Callable[[Block], AnyArray],
+        in_chart: Callable[[AnyArray, AnyArray], AnyArray],
+    ) -> PerBlock:
         if paths is None or self.directions is None:
             # A table joins results along their last axis, which is that of the rows.
-            return rows_last(tuple(table.each(lambda block: rows_last((in_space(block),))[0])), to=1)
-        return tuple(
-            with_columns(in_chart(*lay_out(self.directions, path)), path.in_space, in_space(block.part(path.in_space)))
-            for block, path in zip(table.blocks, paths, strict=True)
-        )
+            return rows_second(tuple(table.each(lambda block: _moved(in_space(block), 1, -1))))
+        blocks = []
+        for block, path in zip(table.blocks, paths, strict=True):
+            values = in_chart(*lay_out(self.directions, path))
+            if path.in_space.shape[0]:
+                values = with_columns(values, path.in_space, in_space(block.part(path.in_space)))
+            blocks.append(values)
+        return tuple(blocks)
 
     def _lifted_in_space(self, block: Block) -> AnyArray:
         return lifted_ring(offsets(self.vertices, block), block.centre(self.frames), self.lift)
@@ -80,7 +92,7 @@ class Places(eqx.Module):
         leaving, arriving = (
             xp.einsum("knac,knc->kna", xp.broadcast_to(basis, near.shape), edge) for basis in (frame, near)
         )
-        # The quotient of both directions as complex numbers, at length one; where an edge has none, no turn.
+        # The quotient of both directions as unit complex numbers; if the edge projects to zero, the identity.
         real = xp.sum(leaving * arriving, axis=-1)
         imaginary = leaving[..., 1] * arriving[..., 0] - leaving[..., 0] * arriving[..., 1]
         squared = real**2 + imaginary**2
@@ -89,20 +101,18 @@ class Places(eqx.Module):
         return xp.where((squared > 0)[..., None], turned, xp.asarray([1, 0], dtype=edge.dtype))
 
 
-def rows_last(lifted: PerBlock, to: int = -1) -> PerBlock:
-    """Lifted rings (K, N, 2) of all blocks with their rows last, (K, 2, N), as a table hands them on in batches; with
-    ``to=1`` back again."""
-    return tuple(values.__array_namespace__().moveaxis(values, 1 if to == -1 else -1, to) for values in lifted)
+def rows_last(lifted: PerBlock) -> PerBlock:
+    """Lifted rings (K, N, 2) of all blocks as (K, 2, N), as a table hands them on in batches."""
+    return tuple(_moved(values, 1, -1) for values in lifted)
 
 
-def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
-    """The neighbours of a block's rows, seen from their vertex; exactly zero in an empty slot.
+def rows_second(lifted: PerBlock) -> PerBlock:
+    """Lifted rings (K, 2, N) of all blocks as (K, N, 2)."""
+    return tuple(_moved(values, -1, 1) for values in lifted)
 
-    Of a vertex whose position is computed in the same jit, XLA may compute the position anew for each side of the
-    difference and round it differently, and a slot that is nearly empty would count as a neighbour.
-    """
-    seen = block.neighbours(vertices) - block.centre(vertices)[None]
-    return seen.__array_namespace__().where(block.is_used[..., None], seen, 0)
+
+def _moved(values: AnyArray, source: int, destination: int) -> AnyArray:
+    return values.__array_namespace__().moveaxis(values, source, destination)
 
 
 def block_paths(

@@ -10,7 +10,7 @@ from typing import Literal
 import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
-from ..tables import AnyArray
+from ..tables import AnyArray, Block
 from .frames import unit
 
 Lift = Literal["projection", "chord"]
@@ -39,6 +39,16 @@ class RingTopology(eqx.Module):
         slot = xp.arange(num_slots, dtype=self.valences.dtype)[:, None]
         valences = self.valences[None]
         return xp.where(slot < valences, xp.where(slot > 0, slot - 1, valences - 1), slot)
+
+
+def offsets(vertices: Float[AnyArray, "V 3"], block: Block) -> Float[AnyArray, "K N 3"]:
+    """The neighbours of a block's rows, seen from their vertex; exactly zero in an empty slot.
+
+    If positions are computed in the same jit, XLA may recompute them for each operand of the difference and round
+    differently. A nearly empty slot would then count as a neighbour.
+    """
+    seen = block.neighbours(vertices) - block.centre(vertices)[None]
+    return seen.__array_namespace__().where(block.is_used[..., None], seen, 0)
 
 
 def take_slots(values: Float[AnyArray, "K N *C"], slots: Int[AnyArray, "J N"]) -> Float[AnyArray, "J N *C"]:

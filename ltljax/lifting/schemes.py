@@ -13,7 +13,7 @@ from ..tables import AnyArray, ReverseWeights, Table, reverse_weights, slot_sum
 from . import intrinsic, jets, paper
 from .frames import boundary_frames, corner_conormals, tangent_frames
 from .intrinsic import CotangentRows, Directions, Paths, RingAngles, Triangulation
-from .layout import PerBlock, Places, offsets, rows_last
+from .layout import PerBlock, Places, rows_last
 from .ring import (
     Lift,
     RingTopology,
@@ -21,6 +21,7 @@ from .ring import (
     centroid_normals,
     inverted_normals,
     last_slot,
+    offsets,
     take_slots,
 )
 
@@ -50,7 +51,7 @@ class Monotone:
         lift: how the ring is laid into the plane. ``"intrinsic"`` unfolds it by edge lengths, so that bending the
             surface, even along a crease, changes nothing. ``"chord"`` projects the ring to the tangent plane and keeps
             the length of every edge; ``"projection"`` is the paper's lift. These two are accurate on smooth surfaces
-            only, where chord is better but for the lowest modes of spheres.
+            only; chord is the better of the two, except for the lowest modes of spheres.
     """
 
     lift: Literal["intrinsic", "chord", "projection"] = "intrinsic"
@@ -66,8 +67,8 @@ class Polynomial:
     """Polynomial fits of degree 3 or 4 on about twice the neighbours they need, for smooth solutions on good meshes.
 
     Normals, gradient and Hessian come from the same fit, and the Laplacian takes the metric of the fitted surface into
-    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. Where the neighbours lie across a
-    crease the fit is made in the intrinsic chart of the vertex, which is exact where both sides are flat and first
+    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. If a fit would cross a
+    crease it is made in the intrinsic chart of the vertex, which is exact where both sides are flat and first
     order where they are curved. Weights of both signs: there is no maximum principle, and on bad meshes the Laplacian
     can have growing modes; `solve` looks for them before it steps.
 
@@ -146,8 +147,9 @@ class Geometry(eqx.Module):
         laplacian_weights: weights on the diffusion table, or None.
         laplacian_reverse: the same weights in the order of the table's reverse, which reverse-mode derivatives read in
             every step; None where the table has no reverse.
-        laplacian_residual: (V,) how far each Laplacian row is from consistent, relative, zero to rounding where it is;
-            after moving the vertices it tells whether the frozen support still serves. None without such rows.
+        laplacian_residual: (V,) how far each Laplacian row is from consistent, relative, zero to rounding where it is
+            and zero at cotangent rows. After the vertices have moved it tells whether the frozen support still serves.
+            None without such rows.
         directions: lengths and directions in the charts of the vertices; None where all rows are laid out in space.
         conormals: (B, 2, 3) the outward conormals of both sides of each boundary vertex, equal where it is smooth.
         flux_weights: (B, 2) what a unit flux through each side adds to the Laplacian there; None without such rows.
@@ -295,12 +297,13 @@ def weigh_in_frames(
     centre = [slot_sum(topology.jet, d) - slot_sum(topology.jet, g) for d, g in zip(along, gradient, strict=True)]
     laplacian, backwards, residual, flux = None, None, None, None
     if not isinstance(scheme, Paper) and topology.diffusion is not None:
-        laplacian, residual, first = diffusion_rows(scheme, laying, topology)
+        laplacian, residual, first, areas = diffusion_rows(scheme, laying, topology)
         backwards = reverse_weights(topology.diffusion, laplacian)
-        sides = xp.einsum("bsc,bac->bsa", conormals, frames[topology.boundary])
-        if directions is not None:
-            sides = intrinsic.boundary_conormals(directions, topology.kinds, topology.boundary)
-        flux = _flux_weights(first[topology.boundary], sides)
+        flux = _flux_weights(first[topology.boundary], _conormals_in_frame(topology, frames, conormals, directions))
+        if areas is not None:
+            # A cotangent row takes half of each side's flux.
+            area = areas[topology.boundary][:, None]
+            flux = xp.where(area > 0, _side_lengths(vertices, topology) / (2 * xp.where(area > 0, area, 1)), flux)
     return Geometry(
         vertices=vertices,
         normals=normals,
@@ -343,15 +346,15 @@ def _height(vertices, normals, topology: Topology, block, weights):
     height = jets.height_jet(offsets(vertices, block), block.centre(normals), weights)
     if topology.triangulation is None:
         return height
-    if topology.is_extrinsic is None:
-        return 0 * height
+    assert topology.is_extrinsic is not None
     return height.__array_namespace__().where(block.centre(topology.is_extrinsic)[None], height, 0)
 
 
 def diffusion_rows(
     scheme: Monotone | Polynomial, laying: Places, topology: Topology
-) -> tuple[PerBlock, Float[AnyArray, " V"], Float[AnyArray, "V 2"]]:
-    """The Laplacian weights on their table, the relative moment residual of every row, and its first moments."""
+) -> tuple[PerBlock, Float[AnyArray, " V"], Float[AnyArray, "V 2"], Float[AnyArray, " V"] | None]:
+    """The Laplacian weights on their table, the relative moment residual of every row, its first moments, and the dual
+    areas of the cotangent rows, zero at other rows."""
     table = topology.diffusion
     assert table is not None
     lifted = laying.lifted(table, topology.diffusion_paths)
@@ -369,15 +372,56 @@ def diffusion_rows(
         return c[0], residual[0]
 
     weights, residuals = zip(*table.each(rows, rows_last(lifted)), strict=True)
+    areas = None
     if topology.cotangent_rows is not None and laying.directions is not None:
-        replaced = [
-            intrinsic.replace_rows(*block, laying.directions)
-            for block in zip(weights, topology.cotangent_rows, strict=True)
-        ]
-        weights = tuple(replaced)
+        weights, residuals, areas = _with_cotangent_rows(topology.cotangent_rows, laying.directions, weights, residuals)
+        areas = table.rows_from(list(areas))
     xp = laying.vertices.__array_namespace__()
     first = [xp.einsum("kn,kna->na", c, places) for c, places in zip(weights, lifted, strict=True)]
-    return weights, table.rows_from(list(residuals)), table.rows_from(first)
+    return weights, table.rows_from(list(residuals)), table.rows_from(first), areas
+
+
+def _with_cotangent_rows(
+    rows: tuple[CotangentRows, ...], directions: Directions, weights: PerBlock, residuals: PerBlock
+) -> tuple[PerBlock, PerBlock, PerBlock]:
+    """Weights and residuals with those of the cotangent rows in their places, and the areas of these rows."""
+    blocks = []
+    for row, weight, residual in zip(rows, weights, residuals, strict=True):
+        cotangent, area = intrinsic.cotangent_weights(directions, row)
+        none = 0 * residual[None]
+        blocks.append(
+            (
+                intrinsic.with_columns(weight, row.columns, cotangent),
+                intrinsic.with_columns(residual[None], row.columns, 0 * area[None])[0],
+                intrinsic.with_columns(none, row.columns, area[None])[0],
+            )
+        )
+    replaced, exact, areas = zip(*blocks, strict=True)
+    return replaced, exact, areas
+
+
+def _conormals_in_frame(topology: Topology, frames, conormals, directions: Directions | None):
+    """The conormals (B, 2, 2) of both sides of each boundary vertex, in the coordinates of its row."""
+    xp = frames.__array_namespace__()
+    in_space = xp.einsum("bsc,bac->bsa", conormals, frames[topology.boundary])
+    if directions is None:
+        return in_space
+    in_chart = intrinsic.boundary_conormals(directions, topology.kinds, topology.boundary)
+    if topology.is_extrinsic is None:
+        return in_chart
+    return xp.where(topology.is_extrinsic[topology.boundary][:, None, None], in_space, in_chart)
+
+
+def _side_lengths(vertices, topology: Topology):
+    """The lengths (B, 2) of the edges to the next and the previous vertex along the boundary."""
+    xp = vertices.__array_namespace__()
+
+    def ends(block, ring):
+        seen = offsets(vertices, block)
+        return xp.stack([seen[0], last_slot(seen, ring)], axis=1)
+
+    both = topology.ring.map(ends, topology.ring_blocks)[topology.boundary]
+    return xp.sqrt(xp.sum(both**2, axis=-1))
 
 
 def _flux_weights(first, conormals):

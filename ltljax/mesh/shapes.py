@@ -156,7 +156,7 @@ def box(sides: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), n
     counts = np.maximum(np.round(n * lengths / lengths.max()).astype(int), 2)
     vertices, faces, start = [], [], 0
     for axis in range(3):
-        rows, columns = counts[(axis + 1) % 3], counts[(axis + 2) % 3]
+        rows, columns = int(counts[(axis + 1) % 3]), int(counts[(axis + 2) % 3])
         lattice = np.indices((rows + 1, columns + 1)).reshape(2, -1)
         upwards = alternating_faces(rows + 1, columns + 1)
         for level, sheet in ((0, upwards[:, ::-1]), (counts[axis], upwards)):
