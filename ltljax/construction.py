@@ -207,7 +207,7 @@ def _choose_neighbours(
 
     laps.end("charts")
     chart_directions, charts = (None, None) if chart is None else (chart.directions, chart.charts)
-    around = Places(vertices, normals, tangent_frames(normals), chart_directions, "projection")
+    around = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
     first = reach_along(rings, around, charts, topology.is_extrinsic)
     one_ring = support.Rows.all_of(first(np.arange(mesh.num_vertices), 1))
     watch_gradient = watch("choosing the neighbours of the gradient")
@@ -237,7 +237,7 @@ def _choose_neighbours(
         # Rows in space are chosen in the tangent planes they will be weighed in.
         normals = surface_normals(scheme, vertices, topology)
         frames, _ = vertex_frames(vertices, normals, topology)
-        places = places_in(scheme, vertices, normals, frames, chart_directions)
+        places = places_in(scheme, topology, vertices, normals, frames, chart_directions)
     topology, report = _choose_diffusion(
         scheme,
         topology,

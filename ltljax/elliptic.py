@@ -78,7 +78,7 @@ class EllipticStencil(eqx.Module):
         As good as the neighbours suit the new coefficients; ``residual`` tells.
         """
         targets = _targets(surface.geometry.frames, diffusion, drift)
-        around = places(surface.scheme, surface.geometry)
+        around = places(surface.scheme, surface.topology, surface.geometry)
         weights, residual = _rows(around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows)
         found = (weights, reverse_weights(self.table, weights), residual, _mean_diffusion(targets))
         weights, reverse, residual, mean = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
@@ -120,7 +120,7 @@ def elliptic_stencil(
             "transformation. Build the stencil outside, and use its `with_coefficients` inside."
         )
     topology, geometry = jax.tree.map(_on_host, (surface.topology, surface.geometry))
-    around, kinds = places(surface.scheme, geometry), topology.kinds
+    around, kinds = places(surface.scheme, topology, geometry), topology.kinds
     drift = None if drift is None else np.asarray(drift, np.float64)
     targets = _targets(geometry.frames, _checked(diffusion, geometry.frames), drift)
     reach = reach_along(

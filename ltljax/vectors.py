@@ -172,8 +172,7 @@ def vector_laplacian(
     Raises:
         ValueError: the scheme is `Paper`, or X does not fit the surface.
 
-    Transport is that of the charts where rows are laid out in them, as by default, and else the shortest rotation
-    between the normals; both are of the order of the paper's transport along edges, which `Paper` has.
+    Transport is the shortest rotation between the refined normals, and at creases that of the charts.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 2, for the idea; the weights as of `laplacian`.
     """
@@ -369,7 +368,7 @@ def _turn(normal: AnyArray, frame: AnyArray, from_normal: AnyArray, from_frame: 
 
 def _turns(surface: Surface, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
     """For every slot the turn (K, N, 2) from the neighbour's frame to the vertex's."""
-    return places(surface.scheme, surface.geometry).turns(table, paths)
+    return places(surface.scheme, surface.topology, surface.geometry).turns(table, paths)
 
 
 def power(z: Float[AnyArray, "*N 2"], exponent: int) -> Float[Array, "*N 2"]:

@@ -7,12 +7,11 @@ Rows are laid out in one of two ways: by edge lengths alone in the chart of the 
 tangent plane (`ring`). The first is the default; the second serves the other lifts, and faces that are folded over.
 """
 
-from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..tables import AnyArray, Block, Table, slot_values
 from .frames import transport
@@ -30,6 +29,7 @@ class Places(eqx.Module):
         normals: (V, 3) unit normals.
         frames: (V, 2, 3) tangent frames, turned like the charts.
         directions: lengths and directions in the charts; None where all rows are laid out in space.
+        is_creased: (V,) the vertices at creases, whose vectors are transported in charts; None where there is none.
         lift: how rows in space are laid into tangent planes.
         transport: how rows in space turn vectors. "shortest" rotates one normal to the other; "paper" takes the edge
             projected to one tangent plane to the same edge projected to the other (Chen, Chi and Wu, arXiv 0907.1817,
@@ -40,6 +40,7 @@ class Places(eqx.Module):
     normals: Float[AnyArray, "V 3"]
     frames: Float[AnyArray, "V 2 3"]
     directions: Directions | None
+    is_creased: Bool[AnyArray, " V"] | None
     lift: Lift = eqx.field(static=True)
     transport: Literal["shortest", "paper"] = eqx.field(static=True, default="shortest")
 
@@ -50,33 +51,33 @@ class Places(eqx.Module):
             table: the neighbours.
             paths: for each block the half-edges that lead to them; None where all rows are laid out in space.
         """
-        return self._each(table, paths, self._lifted_in_space, lambda lifted, _: lifted)
-
-    def turns(self, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
-        """The cosine and sine (K, N, 2) of the angle by which transport turns components, for each block."""
-
-        def in_chart(_, angle):
-            xp = angle.__array_namespace__()
-            return xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
-
-        return self._each(table, paths, self._turns_in_space, in_chart)
-
-    def _each(
-        self,
-        table: Table,
-        paths: tuple[Paths, ...] | None,
-        in_space: Callable[[Block], AnyArray],
-        in_chart: Callable[[AnyArray, AnyArray], AnyArray],
-    ) -> PerBlock:
         if paths is None or self.directions is None:
             # A table joins results along their last axis, which is that of the rows.
-            return rows_second(tuple(table.each(lambda block: _moved(in_space(block), 1, -1))))
+            return rows_second(tuple(table.each(lambda block: _moved(self._lifted_in_space(block), 1, -1))))
         blocks = []
         for block, path in zip(table.blocks, paths, strict=True):
-            values = in_chart(*lay_out(self.directions, path))
+            values = lay_out(self.directions, path)[0]
             if path.in_space.shape[0]:
-                values = with_columns(values, path.in_space, in_space(block.part(path.in_space)))
+                values = with_columns(values, path.in_space, self._lifted_in_space(block.part(path.in_space)))
             blocks.append(values)
+        return tuple(blocks)
+
+    def turns(self, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
+        """The cosine and sine (K, N, 2) of the angle by which transport turns components, for each block.
+
+        In space, between refined normals, transport converges so fast that second derivatives of vectors do; in charts
+        the curvature of a polyhedron lies in single vertices, and they do not. Across creases only charts are right.
+        """
+        in_space = rows_second(tuple(table.each(lambda block: _moved(self._turns_in_space(block), 1, -1))))
+        if paths is None or self.directions is None or self.is_creased is None:
+            return in_space
+        blocks = []
+        for block, path, turn in zip(table.blocks, paths, in_space, strict=True):
+            angle = lay_out(self.directions, path)[1]
+            xp = angle.__array_namespace__()
+            in_chart = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
+            is_near = xp.any(block.neighbours(self.is_creased), axis=0) | block.centre(self.is_creased)
+            blocks.append(xp.where(is_near[None, :, None], in_chart, turn))
         return tuple(blocks)
 
     def _lifted_in_space(self, block: Block) -> AnyArray:

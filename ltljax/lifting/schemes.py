@@ -240,13 +240,14 @@ def vertex_frames(
     return vectors[:, :2], vectors[topology.boundary, 2:]
 
 
-def places(scheme: Scheme, geometry: Geometry) -> Places:
+def places(scheme: Scheme, topology: Topology, geometry: Geometry) -> Places:
     """What lays out the neighbours on a surface."""
-    return places_in(scheme, geometry.vertices, geometry.normals, geometry.frames, geometry.directions)
+    return places_in(scheme, topology, geometry.vertices, geometry.normals, geometry.frames, geometry.directions)
 
 
 def places_in(
     scheme: Scheme,
+    topology: Topology,
     vertices: Float[AnyArray, "V 3"],
     normals: Float[AnyArray, "V 3"],
     frames: Float[AnyArray, "V 2 3"],
@@ -255,7 +256,7 @@ def places_in(
     """What lays out neighbours under a scheme, for given normals, frames and directions."""
     lift = "projection" if scheme.lift == "projection" else "chord"
     transport = "paper" if isinstance(scheme, Paper) else "shortest"
-    return Places(vertices, normals, frames, directions, lift, transport)
+    return Places(vertices, normals, frames, directions, topology.is_creased, lift, transport)
 
 
 def weigh(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Geometry:
@@ -284,7 +285,7 @@ def weigh_in_frames(
     Operators do not depend on the choice of frames, if the charts are turned with them.
     """
     xp = vertices.__array_namespace__()
-    laying = places_in(scheme, vertices, normals, frames, directions)
+    laying = places_in(scheme, topology, vertices, normals, frames, directions)
     lifted = laying.lifted(topology.jet, topology.jet_paths)
     gradient, second = _jet_rows(scheme, vertices, normals, topology, lifted)
     # The divergence takes the neighbour's components, turned into the frame of the vertex, against the weights.
