@@ -77,7 +77,8 @@ class Places(eqx.Module):
             xp = angle.__array_namespace__()
             in_chart = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
             is_near = xp.any(block.neighbours(self.is_creased), axis=0) | block.centre(self.is_creased)
-            blocks.append(xp.where(is_near[None, :, None], in_chart, turn))
+            turned = xp.where(is_near[None, :, None], in_chart, turn)
+            blocks.append(with_columns(turned, path.in_space, turn[:, path.in_space]))
         return tuple(blocks)
 
     def _lifted_in_space(self, block: Block) -> AnyArray:
