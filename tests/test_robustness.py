@@ -55,12 +55,15 @@ def test_crumpled_spheres_give_finite_operators(seed):
     assert_sound(mesh)
 
 
-@pytest.mark.parametrize(("height", "inconsistent"), [(0.0, False), (-0.99, True)])
-def test_a_pit_is_counted_and_stays_stable(height, inconsistent):
+@pytest.mark.parametrize(
+    ("lift", "height", "inconsistent"), [("chord", 0.0, False), ("chord", -0.99, True), ("intrinsic", -0.99, False)]
+)
+@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+def test_a_pit_is_counted_and_stays_stable(lift, height, inconsistent):
     sphere = ltl.shapes.icosphere(2)
     vertices = sphere.vertices.copy()
     vertices[0] *= 1 + height
-    surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, sphere.faces))
+    surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, sphere.faces), ltl.Monotone(lift=lift))
     assert (len(surface.report.inconsistent) > 0) == inconsistent
     assert ("worst moment residual" in str(surface.report)) == inconsistent
     eigenvalues = np.linalg.eigvals(ltl.laplacian_matrix(surface).todense())
