@@ -24,12 +24,6 @@ SURFACES = {
         "A labyrinth on a disk", "Nothing flows through the boundary, which the stripes meet at right angles.",
         "fitzhugh-nagumo", "disk", ["diffusivity.u=5e-4", "diffusivity.v=5e-2"],
     ),
-    "box": (
-        "Spots on a box",
-        "Spots lie across edges and corners as they lie on the sides: the Laplacian does not know how a surface bends\n"
-        "in space.",
-        "barrio-spots", "box", ["diffusivity.u=4.6e-4", "diffusivity.v=9e-4"],
-    ),
     "hand": (
         "Rings on an open hand", "Stripes along the greatest curvature go around fingers. (A scan with a boundary, of\n"
         "the Max Planck Society, CC BY 4.0; its 810 vertices want a coarser pattern.)",

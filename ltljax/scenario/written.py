@@ -54,7 +54,6 @@ _SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
     "hemisphere": (shapes.hemisphere, {"rings": (50, 500)}),
     "square": (shapes.square, {"n": (100, 1500)}),
     "cylinder": (shapes.cylinder, {"n_around": (120, 2000), "n_along": (80, 2000)}),
-    "box": (shapes.box, {"n": (40, 500)}),
 }
 # Direction fields by name: that in which the surface bends most, around limbs, and least, along them.
 _CURVED = {"greatest-curvature": True, "least-curvature": False}
