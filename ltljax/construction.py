@@ -40,7 +40,8 @@ from .tables import Table, build_table, reversible
 # right angle it counts as one.
 _CORNER, _RIGHT = 40, 20
 # An edge is a crease where its two faces turn from one another by more than this many degrees. No height fit crosses a
-# crease: this affects normals, `hodge_laplacian`, `crease_mean`, and where `Polynomial` uses charts.
+# crease: this affects normals, how vectors are transported, `hodge_laplacian`, `crease_mean`, and where `Polynomial`
+# uses charts.
 CREASE = 40
 # The normal of a face with an angle beyond this says little about the surface, and its edges are no creases.
 _FLATTEST = 150

@@ -144,7 +144,7 @@ def torus_gradient_of_laplacian(surface):
 
 def test_curl_and_divergence_of_a_rotation_and_of_a_gradient(spheres):
     errors = []
-    # Two vertices of the coarse random sphere are a thousandth of an edge apart, and their gradients differ.
+    # Two vertices of the coarse random sphere are two thousandths of the mean edge apart, and their gradients differ.
     for surface, bound in zip(spheres, (0.25, 0.1), strict=True):
         z = surface.vertices[:, 2]
         errors.append(float(jnp.sqrt(jnp.mean((ltl.curl(surface, killing(surface)) - 2 * z) ** 2))))
