@@ -29,6 +29,10 @@ SURFACES = {
         "the Max Planck Society, CC BY 4.0; its 810 vertices want a coarser pattern.)",
         "rings", "hand_open.obj", ['diffusivity.u="0.516*0.012"', "diffusivity.v=0.012", "time.end=600"],
     ),
+    "box": (
+        "Spots on a box", "Edges are no obstacle: spots lie across them as they would if the box were unfolded.",
+        "schnakenberg", "box", ["mesh.sides=[2.0, 1.0, 1.5]", "kinetics.rate=600"],
+    ),
 }  # fmt: skip
 
 

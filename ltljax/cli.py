@@ -67,7 +67,9 @@ def _parser() -> argparse.ArgumentParser:
     run_ = commands.add_parser("run", help="solve a scenario and write pictures and data")
     run_.set_defaults(command=_run)
     run_.add_argument("scenario", help="what to solve: a name (see: ltljax list) or a scenario file (see: ltljax new)")
-    run_.add_argument("--mesh", help="sphere, torus, disk, or a mesh file (default: the scenario's own, or sphere)")
+    run_.add_argument(
+        "--mesh", help="sphere, torus, disk, box, or a mesh file (default: the scenario's own, or sphere)"
+    )
     run_.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="a value of a scenario file, such as kinetics.feed=0.05; may be given several times",
@@ -129,7 +131,7 @@ def _add_commands_on_meshes(commands: Any) -> None:
     def command(name: str, on_mesh: Callable[[argparse.Namespace], None], says: str) -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=says, description=says)
         parser.set_defaults(command=_on_mesh, on_mesh=on_mesh)
-        parser.add_argument("mesh", help="sphere, torus, disk, or a mesh file, which keeps its scale")
+        parser.add_argument("mesh", help="sphere, torus, disk, box, or a mesh file, which keeps its scale")
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)"
         )

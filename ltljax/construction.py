@@ -129,8 +129,12 @@ class SurfaceReport:
         return "\n".join(f"{name:<40}{value}" for name, value in lines)
 
 
-def freeze(mesh: Mesh, scheme: Scheme, watch: Watching, laps: Laps) -> tuple[Topology, SurfaceReport]:
+def freeze(
+    mesh: Mesh, scheme: Scheme, watch: Watching, laps: Laps
+) -> tuple[Topology, RingAngles | None, SurfaceReport]:
     """The topology of a mesh under a scheme, in NumPy: the rings, and the neighbours chosen from the positions.
+
+    With it come the angles of the rings, where rows are laid out by them.
 
     Args:
         mesh: the mesh.
@@ -157,7 +161,7 @@ def freeze(mesh: Mesh, scheme: Scheme, watch: Watching, laps: Laps) -> tuple[Top
     )
     laps.end("rings")
     if isinstance(scheme, Paper):
-        return topology, SurfaceReport(dropped_faces=_dropped_faces(mesh, topology))
+        return topology, None, SurfaceReport(dropped_faces=_dropped_faces(mesh, topology))
     return _choose_neighbours(mesh, rings, topology, scheme, watch, laps)
 
 
@@ -196,7 +200,7 @@ def warn_of_rows(report: SurfaceReport, scheme: Scheme, stacklevel: int) -> None
 
 def _choose_neighbours(
     mesh: Mesh, rings: OneRings, topology: Topology, scheme: Monotone | Polynomial, watch: Watching, laps: Laps
-) -> tuple[Topology, SurfaceReport]:
+) -> tuple[Topology, RingAngles | None, SurfaceReport]:
     """The rows of the gradient and of the Laplacian."""
     vertices = mesh.vertices
     normals = ring_normals(scheme, vertices, topology.ring, topology.ring_blocks)
@@ -207,10 +211,11 @@ def _choose_neighbours(
     topology, chart = _lay_charts(mesh, topology, scheme, is_folded, on_crease)
 
     laps.end("charts")
-    chart_directions, charts = (None, None) if chart is None else (chart.directions, chart.charts)
+    angles, chart_directions, charts = (None,) * 3 if chart is None else (chart.angles, chart.directions, chart.charts)
     around = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
     first = reach_along(rings, around, charts, topology.is_extrinsic)
-    one_ring = support.Rows.all_of(first(np.arange(mesh.num_vertices), 1))
+    nearest = first(np.arange(mesh.num_vertices), 1)
+    one_ring = support.Rows.all_of(nearest)
     watch_gradient = watch("choosing the neighbours of the gradient")
     jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, first, watch_gradient)
     report = SurfaceReport(flips=0 if chart is None else chart.num_flips)
@@ -231,25 +236,29 @@ def _choose_neighbours(
     report = dataclasses.replace(report, wide_gradient_rows=wide, undetermined=undetermined)
     laps.end("gradient rows")
     if isinstance(scheme, Polynomial):
-        return dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths), report
+        topology = dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths)
+        return topology, angles, report
 
-    places = around
+    places, reach = around, first
     if chart is None or topology.is_extrinsic is not None:
         # Rows in space are chosen in the tangent planes they will be weighed in.
         normals = surface_normals(scheme, vertices, topology)
         frames, _ = vertex_frames(vertices, normals, topology)
         places = places_in(scheme, topology, vertices, normals, frames, chart_directions)
+        reach = reach_along(rings, places, charts, topology.is_extrinsic)
+        nearest = reach(np.arange(mesh.num_vertices), 1)
     topology, report = _choose_diffusion(
         scheme,
         topology,
         places,
-        reach_along(rings, places, charts, topology.is_extrinsic),
+        reach,
+        nearest,
         chart,
         watch("choosing the neighbours of the Laplacian"),
         report,
     )
     laps.end("Laplacian rows")
-    return topology, report
+    return topology, angles, report
 
 
 def _choose_diffusion(
@@ -257,19 +266,19 @@ def _choose_diffusion(
     topology: Topology,
     places: Places,
     reach: support.Reach,
+    nearest: Neighbourhood,
     chart: "_Chart | None",
     watch: support.Watch,
     report: SurfaceReport,
 ) -> tuple[Topology, SurfaceReport]:
-    """The rows of the Laplacian of `Monotone`."""
-    around = reach(np.arange(len(topology.kinds)), 1)
-    one_ring = support.Rows.all_of(around)
+    """The rows of the Laplacian of `Monotone`, from what reaches the neighbours and those of the first ring."""
+    one_ring = support.Rows.all_of(nearest)
     narrow = dataclasses.replace(topology, **_table_of("diffusion", one_ring, topology, chart))
     _, residual, _, _ = diffusion_rows(scheme, places, narrow)
     is_good = residual <= support.CONSISTENT
     is_cotangent = np.zeros(len(is_good), bool)
     if chart is not None:
-        is_cotangent = _singular_corners(topology.kinds, chart.angles.sums, one_ring) | _is_uneven(around)
+        is_cotangent = _singular_corners(topology.kinds, chart.angles.sums, one_ring) | _is_uneven(nearest)
         if topology.is_extrinsic is not None:
             is_cotangent &= ~topology.is_extrinsic
     rows, record = support.nonnegative_support(

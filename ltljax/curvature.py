@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .construction import CREASE
-from .lifting.jets import INTERIOR
-from .lifting.ring import RingTopology, angle_sums, offsets, take_slots
-from .operators import second_derivatives
+from .lifting.jets import INTERIOR, height_jet, jet_weights
+from .lifting.ring import RingTopology, angle_sums, lifted_ring, offsets, take_slots
+from .lifting.schemes import Paper
 from .surface import Surface
 from .tables import AnyArray, Block
 
@@ -39,10 +39,11 @@ class Curvature(eqx.Module):
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
-    First order on irregular meshes for ``Monotone``, one less than its degree for ``Polynomial``; differentiable in
-    the vertices, but for the principal directions where both curvatures are equal. At a crease or a corner the
-    curvature of the surface is not a number but a measure, and the fit gives values that grow as the mesh is refined:
-    take `polyhedral_curvature` there, and where the integral has to be exact.
+    The fit is made in the tangent plane, whatever the lift of the scheme. First order on irregular meshes for
+    ``Monotone``, one less than its degree for ``Polynomial``; differentiable in the vertices, but for the principal
+    directions where both curvatures are equal. At a crease or a corner the curvature of the surface is not a number but
+    a measure, and the fit gives values that grow as the mesh is refined: take `polyhedral_curvature` there, and where
+    the integral has to be exact.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -50,8 +51,18 @@ def curvature(surface: Surface) -> Curvature:
     Raises:
         ValueError: `Paper` has no second derivatives of its own.
     """
-    frames, normals = surface.geometry.frames, surface.normals
-    xx, xy, yy = (-jnp.sum(part * normals, axis=-1) for part in second_derivatives(surface, surface.vertices))
+    if isinstance(surface.scheme, Paper):
+        raise ValueError("Paper() fits no second derivatives. Use ltl.Monotone() or ltl.Polynomial().")
+    frames, degree = surface.geometry.frames, surface.scheme.degree
+    # With chord lengths a quadratic is exact on spheres; they are not smooth enough to serve a fit of degree 4.
+    lift = "chord" if degree == 2 else "projection"
+
+    def bending(block):
+        seen = offsets(surface.vertices, block)
+        lifted = lifted_ring(seen, block.centre(frames), lift)
+        return height_jet(seen, block.centre(surface.normals), jet_weights(lifted, degree))[2:].T
+
+    xx, xy, yy = -surface.topology.jet.map(bending).T
     mean, gauss = (xx + yy) / 2, xx * yy - xy**2
     half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
     # Where both curvatures are equal the root has no derivative and the angle no value: any will do.

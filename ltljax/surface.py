@@ -75,13 +75,14 @@ class Surface(eqx.Module):
             raise TypeError(f"Expected a scheme such as ltl.Monotone() or ltl.Paper(), found {scheme!r}.")
         dtype = _float_dtype(dtype)
         laps = Laps()
-        topology, report = freeze(mesh, scheme, functools.partial(watched, progress=progress), laps)
+        topology, angles, report = freeze(mesh, scheme, functools.partial(watched, progress=progress), laps)
         if differentiable:
             topology = with_reverse(topology)
             laps.end("reversed tables")
         # On the host in NumPy, where float64 is always at hand and nothing has to be compiled for the mesh's size.
         with np.errstate(over="ignore"):  # an overflow of the cast is found below
-            geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), weigh(scheme, mesh.vertices, topology))
+            geometry = weigh(scheme, mesh.vertices, topology, angles)
+            geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), geometry)
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry)):
             raise ValueError(
                 f"Weights grow like 1 / length^2, and at a mesh size of {mesh.mesh_size:.3g} they leave the range of "

@@ -40,13 +40,20 @@ def latest(folder):
 
 def start(folder, end, intervals):
     command = [sys.executable, "-c", RUN, str(folder), str(end), str(0.1 * intervals)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # A pipe that nobody reads would fill up with warnings, and the process would wait for ever.
+    with said_in(end).open("w") as said:
+        return subprocess.Popen(command, stderr=said)
+
+
+def said_in(end):
+    """The file that holds what the process that writes ``end`` says on standard error."""
+    return end.with_suffix(".log")
 
 
 def killed_and_resumed(tmp_path, kills, intervals):
     """The end of a run that was not interrupted, and of one that was killed that many times on its way."""
     whole, pieces, folder = tmp_path / "whole.npy", tmp_path / "pieces.npy", tmp_path / "b"
-    ends = [start(tmp_path / "a", whole, intervals)]
+    undisturbed = start(tmp_path / "a", whole, intervals)
     chance = random.Random(0)
     for _ in range(kills):
         begun = latest(folder)
@@ -56,13 +63,10 @@ def killed_and_resumed(tmp_path, kills, intervals):
             time.sleep(1e-3)
         time.sleep(chance.uniform(0.0, 0.02))  # anywhere in what an interval does
         process.send_signal(signal.SIGKILL)
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
+        assert process.wait() == -signal.SIGKILL
         assert begun < latest(folder) < intervals - 1
-    ends.append(start(folder, pieces, intervals))
-    for process in ends:
-        said = process.communicate()[1]
-        assert process.returncode == 0, said
+    for process, end in ((undisturbed, whole), (start(folder, pieces, intervals), pieces)):
+        assert process.wait() == 0, said_in(end).read_text()
     return np.load(whole), np.load(pieces)
 
 

@@ -129,9 +129,10 @@ def test_batches_with_other_stages_and_other_ends_have_the_derivatives_of_each(s
     values, slopes = jax.vmap(jax.value_and_grad(value))(d, end)
     for i in range(len(d)):
         one, slope = jax.value_and_grad(value)(d[i], end[i])
-        np.testing.assert_allclose([values[i], slopes[i]], [one, slope], rtol=1e-10)
+        # The slope is a small difference of sums as large as the value, and batches round differently.
+        np.testing.assert_allclose([values[i], slopes[i]], [one, slope], rtol=1e-9)
     of_sum = jax.grad(lambda d: jnp.sum(jax.vmap(value)(d, end)))(d)
-    np.testing.assert_allclose(of_sum, slopes, rtol=1e-10)
+    np.testing.assert_allclose(of_sum, slopes, rtol=1e-9)
 
 
 def test_derivatives_in_the_vertices_and_in_time_dependent_data_pass_the_taylor_test():

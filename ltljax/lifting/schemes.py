@@ -259,13 +259,16 @@ def places_in(
     return Places(vertices, normals, frames, directions, topology.is_creased, lift, transport)
 
 
-def weigh(scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology) -> Geometry:
-    """All weights of a scheme, a pure function of the positions."""
+def weigh(
+    scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology, angles: RingAngles | None = None
+) -> Geometry:
+    """All weights of a scheme, a pure function of the positions. Known angles of the rings save time."""
     normals, triangulation = surface_normals(scheme, vertices, topology), topology.triangulation
     if triangulation is None:
         frames, conormals = vertex_frames(vertices, normals, topology)
         return weigh_in_frames(scheme, vertices, topology, normals, frames, conormals, None)
-    angles = intrinsic.ring_angles(vertices, triangulation, topology.ring, topology.ring_blocks)
+    if angles is None:
+        angles = intrinsic.ring_angles(vertices, triangulation, topology.ring, topology.ring_blocks)
     frames, conormals = vertex_frames(vertices, normals, topology, angles)
     directions = intrinsic.directions(angles, triangulation, topology.kinds)
     return weigh_in_frames(scheme, vertices, topology, normals, frames, conormals, directions)

@@ -75,7 +75,6 @@ class Picture:
                 **painted,
             )
             plotter.view_vector(view, viewup=(0, 1, 0))
-            plotter.camera.zoom(1.1)
         plotter.subplot(0, 0)
         return plotter
 

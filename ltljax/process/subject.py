@@ -90,7 +90,7 @@ def check_positive(**options: float | None) -> None:
 
 
 def load(name: str, repair: bool) -> Subject:
-    """The subject of a name: ``sphere``, ``torus``, ``disk`` or a mesh file, which keeps its scale.
+    """The subject of a name: ``sphere``, ``torus``, ``disk``, ``box`` or a mesh file, which keeps its scale.
 
     Raises:
         MeshError: the file is no acceptable mesh.
@@ -99,6 +99,7 @@ def load(name: str, repair: bool) -> Subject:
         "sphere": lambda: shapes.icosphere(subdivisions=4),
         "torus": lambda: shapes.torus(major=2.0, minor=1.0, n_major=96, n_minor=48),
         "disk": lambda: shapes.disk(rings=40),
+        "box": lambda: shapes.box(n=40),
     }
     path = None if name in built_in else Path(name)
     mesh = built_in[name]() if path is None else load_mesh(path, repair=repair).reordered()

@@ -13,7 +13,7 @@ from ..operators import integrate
 from ..surface import Surface
 from .scenario import Options, Scenario, Settings, scaled_to_unit_area
 
-BUILT_IN = ("sphere", "torus", "disk")
+BUILT_IN = ("sphere", "torus", "disk", "box")
 SOURCES = ("angle", "angle-zero-mean", "sine")
 _MAJOR, _MINOR = 2.0, 1.0
 
@@ -22,7 +22,7 @@ def heat(options: Options) -> Scenario:
     """u_t = Delta u + g from u = 0 (section 3): g = x1, or on the torus a function of the poloidal angle."""
     if options.as_published:
         raise ValueError("--as-published belongs to turing; for heat on the torus see --source angle.")
-    if options.boundary and options.mesh in ("sphere", "torus"):
+    if options.boundary and options.mesh in ("sphere", "torus", "box"):
         raise ValueError(f"--boundary needs a mesh with a boundary; the {options.mesh} is closed.")
     if options.mesh == "torus":
         return _heat_on_torus(options)
@@ -192,6 +192,8 @@ def _diffusion(
 def _from_file(options: Options) -> tuple[Mesh, str]:
     if options.mesh == "disk":
         return shapes.disk(rings=40), "The disk has radius 1."
+    if options.mesh == "box":
+        return shapes.box(n=40), "The box has sides of length 1."
     mesh = load_mesh(options.mesh, repair=options.repair).reordered()
     if options.keep_scale:
         return mesh, f"The mesh keeps its scale: area {mesh.area:.6g}."

@@ -54,7 +54,9 @@ _SHAPES: dict[str, tuple[Callable[..., Mesh], dict[str, tuple[int, int]]]] = {
     "hemisphere": (shapes.hemisphere, {"rings": (50, 500)}),
     "square": (shapes.square, {"n": (100, 1500)}),
     "cylinder": (shapes.cylinder, {"n_around": (120, 2000), "n_along": (80, 2000)}),
+    "box": (shapes.box, {"n": (40, 500)}),
 }
+_TRIPLES = {"axes": (2.0, 1.0, 1.5), "sides": (1.0, 1.0, 1.0)}
 # Direction fields by name: that in which the surface bends most, around limbs, and least, along them.
 _CURVED = {"greatest-curvature": True, "least-curvature": False}
 # States of more bytes than this are not kept without being asked twice.
@@ -188,8 +190,8 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
         for key, (default, most) in counts.items()
     }
     for key, parameter in inspect.signature(make).parameters.items():
-        if key == "axes":
-            arguments[key] = tuple(table.numbers(key, (2.0, 1.0, 1.5), 1e-3, 1e3))
+        if key in _TRIPLES:
+            arguments[key] = tuple(table.numbers(key, _TRIPLES[key], 1e-3, 1e3))
         elif key not in counts:
             arguments[key] = table.number(key, float(parameter.default), 1e-3, 1e3)
     table.finish()

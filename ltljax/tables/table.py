@@ -153,11 +153,15 @@ def _pieces(block: Block, arguments: list[Any]):
         yield here, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
 
 
+# A tail block is joined to the next one if this needs no more slots than this share of the bulk's.
+_FEWER_BLOCKS = 0.05
+
+
 def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
     """The table of rows given as ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
 
-    The slots held are at most the bulk's V * K plus twice the sum of the lengths of the longer rows, and K is the width
-    for which that is least.
+    The slots held are at most the bulk's V * K and a twentieth of it plus twice the sum of the lengths of the longer
+    rows, and K is the width for which V * K and the last sum are least.
 
     Args:
         offsets: (V + 1,) integers.
@@ -239,11 +243,19 @@ def _division(lengths: np.ndarray):
     """The rows of every block and its width; the bulk has all rows, which is written None."""
     width = _bulk_width(lengths)
     yield None, width
+    spare, rows = _FEWER_BLOCKS * width * len(lengths), np.zeros(0, np.int64)
     while width < lengths.max(initial=0):
-        longer = np.flatnonzero((lengths > width) & (lengths <= 2 * width))
+        rows = np.union1d(rows, np.flatnonzero((lengths > width) & (lengths <= 2 * width)))
         width *= 2
-        if len(longer):
-            yield longer, int(lengths[longer].max())
+        wider = lengths[(lengths > width) & (lengths <= 2 * width)]
+        widest = int(lengths[rows].max(initial=0))
+        # Short tail blocks go into the next wider one: programs take a second a block to compile.
+        added = (int(wider.max(initial=0)) - widest) * len(rows)
+        if len(wider) and added <= spare:
+            spare -= added
+        elif len(rows):
+            yield rows, widest
+            rows = rows[:0]
 
 
 def _laid_out(part, offsets, values, lengths, empty=None) -> Block:
