@@ -45,6 +45,8 @@ _CORNER, _RIGHT = 40, 20
 CREASE = 40
 # The normal of a face with an angle beyond this says little about the surface, and its edges are no creases.
 _FLATTEST = 150
+# A steep face with an angle beyond this is taken for one that is folded over.
+_OBTUSE = 120
 
 # How many times as long as its shortest edge a vertex's longest may be, for a quadratic to be fitted to its ring.
 _LARGEST_RATIO = 1e5
@@ -134,13 +136,14 @@ def freeze(
 ) -> tuple[Topology, RingAngles | None, SurfaceReport]:
     """The topology of a mesh under a scheme, in NumPy: the rings, and the neighbours chosen from the positions.
 
-    With it come the angles of the rings, where rows are laid out by them.
-
     Args:
         mesh: the mesh.
         scheme: what the rows are for.
         watch: gives, for the name of a piece of work, what shows how far it has come.
         laps: the stopwatch of the construction.
+
+    Returns:
+        The topology; the angles of the rings, or None where no row is laid out in a chart; and the report.
     """
     rings = one_rings(mesh.faces, mesh.num_vertices)
     ring = build_table(rings.offsets, rings.neighbours)
@@ -201,7 +204,8 @@ def warn_of_rows(report: SurfaceReport, scheme: Scheme, stacklevel: int) -> None
 def _choose_neighbours(
     mesh: Mesh, rings: OneRings, topology: Topology, scheme: Monotone | Polynomial, watch: Watching, laps: Laps
 ) -> tuple[Topology, RingAngles | None, SurfaceReport]:
-    """The rows of the gradient and of the Laplacian."""
+    """The topology with the rows of the gradient and of the Laplacian, the angles of the rings if there are charts, and
+    the report."""
     vertices = mesh.vertices
     normals = ring_normals(scheme, vertices, topology.ring, topology.ring_blocks)
     is_intrinsic = isinstance(scheme, Monotone) and scheme.lift == "intrinsic"
@@ -211,13 +215,15 @@ def _choose_neighbours(
     topology, chart = _lay_charts(mesh, topology, scheme, is_folded, on_crease)
 
     laps.end("charts")
-    angles, chart_directions, charts = (None,) * 3 if chart is None else (chart.angles, chart.directions, chart.charts)
+    angles, chart_directions, charts = None, None, None
+    if chart is not None:
+        angles, chart_directions, charts = chart.angles, chart.directions, chart.charts
     around = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
-    first = reach_along(rings, around, charts, topology.is_extrinsic)
-    nearest = first(np.arange(mesh.num_vertices), 1)
+    reach = reach_along(rings, around, charts, topology.is_extrinsic)
+    nearest = reach(np.arange(mesh.num_vertices), 1)
     one_ring = support.Rows.all_of(nearest)
     watch_gradient = watch("choosing the neighbours of the gradient")
-    jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, first, watch_gradient)
+    jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach, watch_gradient)
     report = SurfaceReport(flips=0 if chart is None else chart.num_flips)
     if on_crease is not None:
         is_wide = np.full(mesh.num_vertices, isinstance(scheme, Polynomial))
@@ -239,7 +245,7 @@ def _choose_neighbours(
         topology = dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths)
         return topology, angles, report
 
-    places, reach = around, first
+    places = around
     if chart is None or topology.is_extrinsic is not None:
         # Rows in space are chosen in the tangent planes they will be weighed in.
         normals = surface_normals(scheme, vertices, topology)
@@ -271,7 +277,8 @@ def _choose_diffusion(
     watch: support.Watch,
     report: SurfaceReport,
 ) -> tuple[Topology, SurfaceReport]:
-    """The rows of the Laplacian of `Monotone`, from what reaches the neighbours and those of the first ring."""
+    """The rows of the Laplacian of `Monotone`. ``reach`` finds wider neighbourhoods; ``nearest`` holds the one-rings,
+    already laid out."""
     one_ring = support.Rows.all_of(nearest)
     narrow = dataclasses.replace(topology, **_table_of("diffusion", one_ring, topology, chart))
     _, residual, _, _ = diffusion_rows(scheme, places, narrow)
@@ -323,11 +330,15 @@ def _lay_charts(
     if on_crease is None or (isinstance(scheme, Polynomial) and not on_crease.any()):
         return topology, None
     triangulation, half_edges, angles = delaunay_triangulation(
-        mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks
+        mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks, is_folded
     )
     chart_directions = directions(angles, triangulation, topology.kinds)
     charts = Charts(
-        triangulation.tails, topology.kinds, chart_directions, is_folded, support.LARGEST_FIT[scheme.degree]
+        triangulation.tails,
+        topology.kinds,
+        chart_directions,
+        _surrounded(topology.ring, is_folded),
+        support.LARGEST_FIT[scheme.degree],
     )
     is_extrinsic = is_folded if isinstance(scheme, Monotone) else np.ones_like(is_folded)
     topology = dataclasses.replace(
@@ -379,9 +390,14 @@ def charts_of(scheme: Scheme, topology: Topology, places: Places) -> Charts | No
         return None
     is_closed = np.zeros(len(topology.kinds), bool)
     if isinstance(scheme, Monotone) and topology.is_extrinsic is not None:
-        is_closed = topology.is_extrinsic
+        is_closed = _surrounded(topology.ring, np.asarray(topology.is_extrinsic))
     longest = support.LARGEST_FIT.get(getattr(scheme, "degree", 2), support.LARGEST_RING)
     return Charts(topology.triangulation.tails, topology.kinds, places.directions, is_closed, longest)
+
+
+def _surrounded(ring: Table, is_folded: np.ndarray) -> np.ndarray:
+    """The vertices at folded faces, (V,), among these and their neighbours: no path may lead through them."""
+    return is_folded & ring.map(lambda block: block.neighbours(is_folded).all(axis=0))
 
 
 def _table_of(name: str, rows: support.Rows, topology: Topology, chart: _Chart | None) -> dict[str, Any]:
@@ -426,11 +442,13 @@ def _creased_vertices(mesh: Mesh) -> np.ndarray:
 def _at_folded_faces(mesh: Mesh, normals: np.ndarray) -> np.ndarray:
     """Which vertices belong to a face that is folded over, or are neighbours of one that does, (V,).
 
-    The normal of such a face points away from the normals of the rings at all three of its corners.
+    The normal of such a face points away from the normals of the rings at all three of its corners. An obtuse face that
+    stands on end, more than 60 degrees from all three, counts as folded too.
     """
     face_normals = _face_normals(mesh)
-    cosine = np.einsum("fkc,fc->fk", normals[mesh.faces], face_normals)
-    is_folded = (cosine < 0).all(axis=1)
+    cosine = np.einsum("fkc,fc->fk", normals[mesh.faces], face_normals).max(axis=1)
+    is_obtuse = corner_angles(mesh.vertices, mesh.faces).max(axis=1) > np.radians(_OBTUSE)
+    is_folded = (cosine < 0) | (is_obtuse & (cosine < 0.5 * np.linalg.norm(face_normals, axis=1)))
     is_at = np.zeros(mesh.num_vertices, bool)
     is_at[mesh.faces[is_folded]] = True
     is_beside = is_at[mesh.faces].any(axis=1)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from .construction import CREASE
 from .lifting.jets import INTERIOR, height_jet, jet_weights
 from .lifting.ring import RingTopology, angle_sums, lifted_ring, offsets, take_slots
-from .lifting.schemes import Paper
+from .lifting.schemes import Monotone
+from .operators import second_derivatives
 from .surface import Surface
 from .tables import AnyArray, Block
 
@@ -39,11 +40,11 @@ class Curvature(eqx.Module):
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
-    The fit is made in the tangent plane, whatever the lift of the scheme. First order on irregular meshes for
-    ``Monotone``, one less than its degree for ``Polynomial``; differentiable in the vertices, but for the principal
-    directions where both curvatures are equal. At a crease or a corner the curvature of the surface is not a number but
-    a measure, and the fit gives values that grow as the mesh is refined: take `polyhedral_curvature` there, and where
-    the integral has to be exact.
+    The result is of first order for ``Monotone`` on irregular meshes, and of one order less than its degree for
+    ``Polynomial``. ``Monotone`` fits in the tangent plane with chord lengths, whatever its lift, and is nearly exact on
+    spheres. Differentiable in the vertices, but for the principal directions where both curvatures are equal. At a
+    crease or a corner the curvature of the surface is not a number but a measure, and the fit gives values that grow as
+    the mesh is refined: take `polyhedral_curvature` there, and where the integral has to be exact.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -51,18 +52,8 @@ def curvature(surface: Surface) -> Curvature:
     Raises:
         ValueError: `Paper` has no second derivatives of its own.
     """
-    if isinstance(surface.scheme, Paper):
-        raise ValueError("Paper() fits no second derivatives. Use ltl.Monotone() or ltl.Polynomial().")
-    frames, degree = surface.geometry.frames, surface.scheme.degree
-    # With chord lengths a quadratic is exact on spheres; they are not smooth enough to serve a fit of degree 4.
-    lift = "chord" if degree == 2 else "projection"
-
-    def bending(block):
-        seen = offsets(surface.vertices, block)
-        lifted = lifted_ring(seen, block.centre(frames), lift)
-        return height_jet(seen, block.centre(surface.normals), jet_weights(lifted, degree))[2:].T
-
-    xx, xy, yy = -surface.topology.jet.map(bending).T
+    frames = surface.geometry.frames
+    xx, xy, yy = _bending(surface) if isinstance(surface.scheme, Monotone) else _bending_of_positions(surface)
     mean, gauss = (xx + yy) / 2, xx * yy - xy**2
     half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
     # Where both curvatures are equal the root has no derivative and the angle no value: any will do.
@@ -79,6 +70,26 @@ def curvature(surface: Surface) -> Curvature:
         principal=jnp.stack([mean + root, mean - root], axis=-1),
         directions=jnp.einsum("vpa,vac->vpc", turned, frames),
     )
+
+
+def _bending(surface: Surface) -> Float[Array, "3 V"]:
+    """The second fundamental form xx, xy, yy in the frames, from quadratic fits with chord lengths, which are exact on
+    spheres whose normals are; in the widest float that JAX has switched on, and cast last."""
+    wide = jnp.promote_types(jnp.result_type(float), surface.dtype)
+    vertices, normals, frames = (x.astype(wide) for x in (surface.vertices, surface.normals, surface.geometry.frames))
+
+    def bending(block):
+        seen = offsets(vertices, block)
+        weights = jet_weights(lifted_ring(seen, block.centre(frames), "chord"), 2)
+        return -height_jet(seen, block.centre(normals), weights)[2:].T
+
+    return surface.topology.jet.map(bending).T.astype(surface.dtype)
+
+
+def _bending_of_positions(surface: Surface) -> Float[Array, "3 V"]:
+    """The second fundamental form xx, xy, yy in the frames, from the scheme's own second derivatives."""
+    parts = jnp.stack(second_derivatives(surface, surface.vertices))
+    return -jnp.sum(parts * surface.normals[None], axis=-1)
 
 
 class PolyhedralCurvature(eqx.Module):

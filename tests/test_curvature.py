@@ -58,3 +58,11 @@ def test_it_is_differentiable_in_the_vertices():
 
     slope, step = jax.grad(total)(0.0), 1e-5
     assert float((total(step) - total(-step)) / (2 * step)) == pytest.approx(float(slope), rel=1e-6)
+
+
+@pytest.mark.parametrize("lift", ["intrinsic", "chord", "projection"])
+def test_the_fitted_curvature_of_a_sphere_is_nearly_exact_whatever_the_lift(lift):
+    surface = ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(3, 0.4, seed=0), ltl.Monotone(lift=lift))
+    found = ltl.curvature(surface)
+    np.testing.assert_allclose(found.mean, 1, atol=1e-4)
+    np.testing.assert_allclose(found.gauss, 1, atol=1e-4)

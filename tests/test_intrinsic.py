@@ -406,3 +406,19 @@ def test_a_batch_of_moved_surfaces(dtype):
     u = surface.vertices[:, 1] ** 2
     found = jax.vmap(lambda s: ltl.laplacian(surface.with_vertices(s * surface.vertices.astype(s.dtype)), u))(scales)
     np.testing.assert_allclose(found[0], 4 * found[1], rtol=1e-4 if dtype == "float32" else 1e-10, atol=1e-3)
+
+
+def test_no_edge_leads_through_a_face_that_is_folded_over():
+    mesh = ltl.shapes.jittered_torus(96, 48, 0.45, seed=0)
+    surface = ltl.Surface.from_mesh(mesh)
+    is_extrinsic = np.zeros(mesh.num_vertices, bool)
+    is_extrinsic[surface.report.extrinsic] = True
+    assert 0 < is_extrinsic.sum() < 0.3 * mesh.num_vertices
+    ends = np.asarray(surface.topology.triangulation.tails).reshape(-1, 2)
+    chords = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
+    lengths = np.asarray(surface.geometry.directions.lengths)[: len(ends)]
+    assert (lengths / chords)[~is_extrinsic[ends].all(axis=1)].max() < 1.1  # 1.3 through folded faces
+    height, across = mesh.vertices[:, 2], np.hypot(*mesh.vertices[:, :2].T) - 2
+    exact = -height - height * across / (2 + across)
+    error = np.asarray(ltl.laplacian(surface, surface.vertices[:, 2])) - exact
+    assert np.sqrt(np.mean(error**2)) < 0.03

@@ -150,6 +150,15 @@ def test_a_built_in_mesh_takes_changes(tmp_path, no_pictures):
     assert json.loads((tmp_path / "summary.json").read_text())["mesh"]["vertices"] == 162
 
 
+def test_a_box_has_the_sides_it_is_given(tmp_path):
+    changes = {"mesh": {"shape": "box"}, "mesh.sides": [2.0, 1.0, 1.5], "mesh.n": 8}
+    mesh = scenario.read(PLAIN, "box", tmp_path, changes).mesh
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2.0, 1.0, 1.5])
+    assert mesh.area == pytest.approx(13)
+    with pytest.raises(scenario.ScenarioError, match="sides"):
+        scenario.read(PLAIN, "box", tmp_path, changes | {"mesh.sides": [2.0, 1.0]})
+
+
 def test_states_come_from_a_file_beside_the_scenario(tmp_path):
     state = {name: np.random.default_rng(0).random(162) for name in "uv"}
     np.savez(tmp_path / "start.npz", **state)

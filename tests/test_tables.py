@@ -105,3 +105,18 @@ def test_the_loop_is_the_sum_over_the_rows(rows, seed):
         found, back = jax.vjp(lambda u: difference_sum(table, tuple(weights), u), jnp.asarray(u))
         np.testing.assert_allclose(found, dense @ u, atol=1e-11)
         np.testing.assert_allclose(back(found)[0], dense.T @ np.asarray(found), atol=1e-9)
+
+
+def test_small_tail_blocks_are_joined_and_large_ones_are_not():
+    def blocks(*tails):
+        lengths = np.array([6] * 1000 + [length for length, count in tails for _ in range(count)])
+        offsets = np.concatenate([[0], np.cumsum(lengths)])
+        table = build_table(offsets, np.zeros(offsets[-1], np.int32))
+        longer = lengths[lengths > 6].sum()
+        assert table.num_slots <= 1.05 * 6 * len(lengths) + 2 * longer
+        return [block.indices.shape for block in table.blocks[1:]]
+
+    assert blocks((9, 20), (14, 5)) == [(14, 25)]
+    assert blocks((9, 20), (50, 1)) == [(9, 20), (50, 1)]  # of no neighbouring widths
+    assert blocks((9, 100), (14, 100)) == [(9, 100), (14, 100)]
+    assert blocks((7, 1), (13, 1), (25, 1), (49, 1)) == [(49, 4)]

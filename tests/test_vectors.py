@@ -22,12 +22,6 @@ def spheres(request):
     return [ltl.Surface.from_mesh(SPHERES[request.param](level)) for level in (3, 4)]
 
 
-@pytest.fixture(scope="module", params=list(SPHERES))
-def spheres_apart(request):
-    """Two levels apart: on random points the errors of second derivatives are noisy from one level to the next."""
-    return [ltl.Surface.from_mesh(SPHERES[request.param](level)) for level in (3, 5)]
-
-
 @pytest.fixture(scope="module")
 def jittered():
     return ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(3, 0.4, seed=1))
@@ -74,14 +68,14 @@ def order(errors):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_vector_laplacian_converges_pointwise_on_spheres(spheres_apart, name):
+def test_the_vector_laplacian_converges_pointwise_on_spheres(spheres, name):
     field, eigenvalue = FIELDS[name]
     errors = []
-    for surface in spheres_apart:
+    for surface in spheres:
         X = field(surface)
         errors.append(rms(ltl.vector_laplacian(surface, X) - eigenvalue * X) / rms(X))
-    assert order(errors) / 2 >= 0.9
-    assert errors[1] < LARGEST[name] / 2
+    assert order(errors) >= 0.9
+    assert errors[1] < LARGEST[name]
 
 
 def test_the_vector_heat_equation_is_of_second_order(spheres):
@@ -115,17 +109,17 @@ def quietly(mesh):
         return ltl.Surface.from_mesh(mesh)
 
 
-def test_the_hodge_laplacian_takes_gradients_to_gradients(spheres_apart, tori):
-    for surfaces, levels, scale in ((spheres_apart, 2, 0.075), (tori, 1, 0.05)):
+def test_the_hodge_laplacian_takes_gradients_to_gradients(spheres, tori):
+    for surfaces, scale in ((spheres, 0.15), (tori, 0.05)):
         errors = []
         for surface in surfaces:
-            if surfaces is spheres_apart:  # of a linear function Delta u = -2 u
+            if surfaces is spheres:  # of a linear function Delta u = -2 u
                 slope, expected = of_degree_1(surface), -2 * of_degree_1(surface)
             else:
                 slope, expected = torus_gradient(surface), torus_gradient_of_laplacian(surface)
             found = ltl.hodge_laplacian(surface, slope)
             errors.append(rms(found - expected) / rms(expected))
-        assert order(errors) / levels >= 0.9
+        assert order(errors) >= 0.9
         assert errors[1] < scale
 
 
@@ -150,12 +144,13 @@ def torus_gradient_of_laplacian(surface):
 
 def test_curl_and_divergence_of_a_rotation_and_of_a_gradient(spheres):
     errors = []
-    for surface in spheres:
+    # Two vertices of the coarse random sphere are two thousandths of the mean edge apart, and their gradients differ.
+    for surface, bound in zip(spheres, (0.25, 0.1), strict=True):
         z = surface.vertices[:, 2]
         errors.append(float(jnp.sqrt(jnp.mean((ltl.curl(surface, killing(surface)) - 2 * z) ** 2))))
         other = ltl.rotated_gradient(surface, z)  # clockwise about the top, which is to its right
         assert rms(other + killing(surface)) < 0.05
-        assert float(jnp.sqrt(jnp.mean(ltl.divergence(surface, other) ** 2))) < 0.1
+        assert float(jnp.sqrt(jnp.mean(ltl.divergence(surface, other) ** 2))) < bound
     assert order(errors) >= 0.9
     assert errors[1] < 0.02
 

@@ -37,12 +37,17 @@ class HalfEdges:
 
 
 def delaunay_triangulation(
-    faces: np.ndarray, vertices: np.ndarray, ring: Table, ring_blocks: tuple[RingTopology, ...]
+    faces: np.ndarray,
+    vertices: np.ndarray,
+    ring: Table,
+    ring_blocks: tuple[RingTopology, ...],
+    is_folded: np.ndarray,
 ) -> tuple[Triangulation, HalfEdges, RingAngles]:
     """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
 
     Every round flips a set of edges that do not share a face, those first whose opposite angles exceed pi the most, and
-    looks again at the edges around them.
+    looks again at the edges around them. Edges between two vertices marked in ``is_folded`` (V,) stay, so that no edge
+    leads through a face that is folded over.
     """
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()
@@ -54,6 +59,8 @@ def delaunay_triangulation(
     face_of[corner] = np.minimum(corner, np.minimum(following[corner], following[following[corner]]))
     levels, candidates = [], np.arange(len(ends))
     while len(candidates):
+        is_kept = is_folded[tails[2 * candidates]] & is_folded[tails[2 * candidates + 1]]
+        candidates = candidates[~is_kept]
         excess = _excess(candidates, following, face_of, lengths)
         wanting, excess = candidates[excess > _TIE], excess[excess > _TIE]
         h = 2 * wanting[_independent(wanting, excess, face_of)]

@@ -5,14 +5,13 @@ With lifted coordinates (x, y) of the neighbours, weights c give an operator at 
 d/dx, (0, 0, 0, 2, 2) for the Laplacian; and zero for every further monomial of the degree. Among all such weights
 those of least ``sum c^2 / w`` are taken: the rows of the least-squares fit of a polynomial through the vertex with
 weights w. With w = r^-4, r the distance, diffusion is most accurate; fits of degree 3 and 4 have twice the neighbours
-they need, and are best with w = r^-2. Very close to the vertex w is bounded. The first and second derivatives of the
-fit are the jet of the field.
+they need, and are best with w = r^-2. The first and second derivatives of the fit are the jet of the field.
 
 Source: the configuration equation of Wu, Chen and Chi, arXiv 1310.4807; here as a constrained least norm, of any
 degree.
 """
 
-import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +29,6 @@ LAPLACIAN = np.array([[0, 0, 0, 2, 2]], float)
 # fluxes at a corner, of about a right angle or of another.
 INTERIOR, SMOOTH, RIGHT_CORNER, OTHER_CORNER = range(4)
 _REFINEMENTS = 2
-# The weights of the fit do not grow further within this share of the ring's root mean square radius. If a neighbour lay
-# much closer than the others, the error of the direction in which it is seen would decide the gradient.
-_NEAREST = 0.1
 
 
 def num_monomials(degree: int) -> int:
@@ -145,7 +141,7 @@ def ring_moments(
     mean_square = xp.sum(squared, axis=0) / count
     scale = xp.sqrt(xp.where(mean_square > 0, mean_square, 1))
     x, y = lifted[..., 0] / scale[None], lifted[..., 1] / scale[None]
-    weights = xp.where(is_used, scale[None] ** 2 / (squared + (_NEAREST * scale[None]) ** 2), 0)
+    weights = xp.where(is_used, scale[None] ** 2 / xp.where(is_used, squared, 1), 0)
     weights = weights**2 if degree == 2 else weights
     moments = conditions(xp.stack([emphasis * x, emphasis * y, x * y, x**2, y**2]), kinds, 0)
     # By products: NumPy raises to a power one logarithm at a time.
@@ -236,7 +232,7 @@ def _inverse(matrix: Float[AnyArray, "M M N"]) -> Float[AnyArray, "M M N"]:
 
 @jax.custom_jvp
 def _differentiable_inverse(matrix: Float[Array, "M M N"]) -> Float[Array, "M M N"]:
-    return jnp.asarray(_sweep(matrix))
+    return _sweep(matrix)
 
 
 @_differentiable_inverse.defjvp
@@ -245,7 +241,7 @@ def _(primals, tangents):
     return inverse, -_products(inverse, _products(tangents[0], inverse))
 
 
-def _sweep(matrix):
+def _sweep(matrix: AnyArray) -> Any:
     """Gauss-Jordan elimination by rank-one updates, without pivots (Goodnight 1979, A tutorial on the sweep operator).
 
     A handful of passes over whole arrays, where a batched factorisation would call LAPACK once a vertex.
@@ -253,12 +249,15 @@ def _sweep(matrix):
     xp = matrix.__array_namespace__()
     identity = xp.eye(matrix.shape[0], dtype=matrix.dtype)
 
-    def eliminated(k, matrix):
-        pivot, own = matrix[k, k], identity[k]
+    def eliminated(k, swept):
+        pivot, own = swept[k, k], identity[k]
         # With pivot - 1 in its own place the update also divides the pivot's row and column by the pivot.
-        row = matrix[k] - own[:, None]
-        return matrix - row[:, None] * (row / pivot[None])[None] - 2 * (own[:, None] * own[None])[..., None]
+        row = swept[k] - own[:, None]
+        return swept - row[:, None] * (row / pivot[None])[None] - 2 * (own[:, None] * own[None])[..., None]
 
-    if isinstance(matrix, np.ndarray):
-        return -functools.reduce(lambda swept, k: eliminated(k, swept), range(len(matrix)), matrix)
-    return -jax.lax.fori_loop(0, len(matrix), eliminated, matrix)
+    if not isinstance(matrix, np.ndarray):
+        return -jax.lax.fori_loop(0, len(matrix), eliminated, matrix)
+    swept = matrix
+    for k in range(len(matrix)):
+        swept = eliminated(k, swept)
+    return -swept

@@ -262,7 +262,10 @@ def places_in(
 def weigh(
     scheme: Scheme, vertices: Float[AnyArray, "V 3"], topology: Topology, angles: RingAngles | None = None
 ) -> Geometry:
-    """All weights of a scheme, a pure function of the positions. Known angles of the rings save time."""
+    """All weights of a scheme, a pure function of the positions.
+
+    Angles of the rings at these positions may be handed in, which saves computing them again.
+    """
     normals, triangulation = surface_normals(scheme, vertices, topology), topology.triangulation
     if triangulation is None:
         frames, conormals = vertex_frames(vertices, normals, topology)

@@ -22,7 +22,7 @@ def heat(options: Options) -> Scenario:
     """u_t = Delta u + g from u = 0 (section 3): g = x1, or on the torus a function of the poloidal angle."""
     if options.as_published:
         raise ValueError("--as-published belongs to turing; for heat on the torus see --source angle.")
-    if options.boundary and options.mesh in ("sphere", "torus", "box"):
+    if options.boundary and options.mesh in ("sphere", "torus"):
         raise ValueError(f"--boundary needs a mesh with a boundary; the {options.mesh} is closed.")
     if options.mesh == "torus":
         return _heat_on_torus(options)
@@ -36,7 +36,7 @@ def heat(options: Options) -> Scenario:
             exact=lambda t: x1 * (1 - math.exp(-2 * t)) / 2,
             exact_is="x1 (1 - exp(-2 t)) / 2, which tends to x1 / 2",
         )  # fmt: skip
-    mesh, note = _from_file(options)
+    mesh, note = _mesh_of(options)
     x1 = mesh.vertices[:, 0]
     conditions = tuple(parse_condition(text) for text in options.boundary)
     if conditions and mesh.is_closed:
@@ -116,7 +116,7 @@ def turing(options: Options) -> Scenario:
     elif options.mesh == "torus":
         mesh = shapes.torus(major=_MAJOR, minor=_MINOR, n_major=144, n_minor=72)
     else:
-        mesh, scale = _from_file(options)
+        mesh, scale = _mesh_of(options)
         note = (scale,)
     if options.as_published:
         reaction = dict(rate=2.0, feed=16.0, decay=0.0)
@@ -189,7 +189,7 @@ def _diffusion(
     )
 
 
-def _from_file(options: Options) -> tuple[Mesh, str]:
+def _mesh_of(options: Options) -> tuple[Mesh, str]:
     if options.mesh == "disk":
         return shapes.disk(rings=40), "The disk has radius 1."
     if options.mesh == "box":

@@ -3,7 +3,7 @@
 Tables are slot-major: ``indices[k, v]`` is the neighbour of vertex v in slot k. An empty slot holds v's own index and
 weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few rows longer than
 most do not widen the table: the bulk has the width that costs the least memory, and longer rows live in tail blocks
-whose widths double, so at most half of any tail block is padding.
+whose widths about double. Small tail blocks are joined, at a cost of at most a twentieth of the bulk.
 
 A table can carry its reverse: for every vertex, the rows that use it. With it a transposed sum gathers, where the plain
 transpose of a gather would scatter, which is several times slower.
@@ -153,15 +153,15 @@ def _pieces(block: Block, arguments: list[Any]):
         yield here, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
 
 
-# A tail block is joined to the next one if this needs no more slots than this share of the bulk's.
+# Tail blocks are joined as long as the slots this adds, over all joins, are at most this share of the bulk's.
 _FEWER_BLOCKS = 0.05
 
 
 def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
     """The table of rows given as ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
 
-    The slots held are at most the bulk's V * K and a twentieth of it plus twice the sum of the lengths of the longer
-    rows, and K is the width for which V * K and the last sum are least.
+    At most 1.05 V K + 2 L slots are held, where L is the sum of the lengths of the rows longer than K. K is the width
+    for which V K + 2 L is least.
 
     Args:
         offsets: (V + 1,) integers.
@@ -249,7 +249,7 @@ def _division(lengths: np.ndarray):
         width *= 2
         wider = lengths[(lengths > width) & (lengths <= 2 * width)]
         widest = int(lengths[rows].max(initial=0))
-        # Short tail blocks go into the next wider one: programs take a second a block to compile.
+        # Small tail blocks join the next wider one: every block adds about a second to the compile time of a program.
         added = (int(wider.max(initial=0)) - widest) * len(rows)
         if len(wider) and added <= spare:
             spare -= added
