@@ -77,7 +77,8 @@ class SurfaceReport:
             solutions converge, and the Laplacian of a field at the vertex itself need not.
         inconsistent: vertices without a consistent non-negative row, the cotangent rows aside. Diffusion is stable
             there, but not accurate.
-        extrinsic: vertices at faces that are folded over, and their neighbours. Their rows are laid out in space.
+        extrinsic: vertices at faces that are folded over or stand on end, and their neighbours. Their rows are laid out
+            in space.
         creased: vertices whose neighbours lie across a crease, so that no height fit is made there.
         flips: the number of edge flips that lead to the intrinsic Delaunay triangulation.
         seconds: how long each part of the construction took.
