@@ -45,8 +45,6 @@ _CORNER, _RIGHT = 40, 20
 CREASE = 40
 # The normal of a face with an angle beyond this says little about the surface, and its edges are no creases.
 _FLATTEST = 150
-# A steep face with an angle beyond this is taken for one that is folded over.
-_OBTUSE = 120
 
 # How many times as long as its shortest edge a vertex's longest may be, for a quadratic to be fitted to its ring.
 _LARGEST_RATIO = 1e5
@@ -77,8 +75,7 @@ class SurfaceReport:
             solutions converge, and the Laplacian of a field at the vertex itself need not.
         inconsistent: vertices without a consistent non-negative row, the cotangent rows aside. Diffusion is stable
             there, but not accurate.
-        extrinsic: vertices at faces that are folded over or stand on end, and their neighbours. Their rows are laid out
-            in space.
+        extrinsic: vertices at faces that are folded over, and their neighbours. Their rows are laid out in space.
         creased: vertices whose neighbours lie across a crease, so that no height fit is made there.
         flips: the number of edge flips that lead to the intrinsic Delaunay triangulation.
         seconds: how long each part of the construction took.
@@ -443,13 +440,11 @@ def _creased_vertices(mesh: Mesh) -> np.ndarray:
 def _at_folded_faces(mesh: Mesh, normals: np.ndarray) -> np.ndarray:
     """Which vertices belong to a face that is folded over, or are neighbours of one that does, (V,).
 
-    The normal of such a face points away from the normals of the rings at all three of its corners. An obtuse face that
-    stands on end, more than 60 degrees from all three, counts as folded too.
+    The normal of such a face points away from the normals of the rings at all three of its corners.
     """
     face_normals = _face_normals(mesh)
-    cosine = np.einsum("fkc,fc->fk", normals[mesh.faces], face_normals).max(axis=1)
-    is_obtuse = corner_angles(mesh.vertices, mesh.faces).max(axis=1) > np.radians(_OBTUSE)
-    is_folded = (cosine < 0) | (is_obtuse & (cosine < 0.5 * np.linalg.norm(face_normals, axis=1)))
+    cosine = np.einsum("fkc,fc->fk", normals[mesh.faces], face_normals)
+    is_folded = (cosine < 0).all(axis=1)
     is_at = np.zeros(mesh.num_vertices, bool)
     is_at[mesh.faces[is_folded]] = True
     is_beside = is_at[mesh.faces].any(axis=1)
