@@ -394,7 +394,8 @@ def charts_of(scheme: Scheme, topology: Topology, places: Places) -> Charts | No
 
 
 def _surrounded(ring: Table, is_folded: np.ndarray) -> np.ndarray:
-    """The vertices at folded faces, (V,), among these and their neighbours: no path may lead through them."""
+    """Of the marked vertices those with marked neighbours only, (V,). If corners of folded faces and their neighbours
+    are marked, every such corner is among them; no path may lead through them."""
     return is_folded & ring.map(lambda block: block.neighbours(is_folded).all(axis=0))
 
 

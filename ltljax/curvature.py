@@ -5,6 +5,7 @@ docs/curvature.md says which of the two is right when.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,7 +16,7 @@ from .lifting.ring import RingTopology, angle_sums, lifted_ring, offsets, take_s
 from .lifting.schemes import Monotone
 from .operators import second_derivatives
 from .surface import Surface
-from .tables import AnyArray, Block
+from .tables import AnyArray, Block, Table
 
 
 class Curvature(eqx.Module):
@@ -36,15 +37,17 @@ class Curvature(eqx.Module):
     directions: Float[Array, "V 2 3"]
 
 
-@eqx.filter_jit
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
-    The result is of first order for ``Monotone`` on irregular meshes, and of one order less than its degree for
-    ``Polynomial``. ``Monotone`` fits in the tangent plane with chord lengths, whatever its lift, and is nearly exact on
-    spheres. Differentiable in the vertices, but for the principal directions where both curvatures are equal. At a
-    crease or a corner the curvature of the surface is not a number but a measure, and the fit gives values that grow as
-    the mesh is refined: take `polyhedral_curvature` there, and where the integral has to be exact.
+    The result is of first order for ``Monotone`` on irregular meshes, and of order degree - 1 for ``Polynomial``.
+    ``Monotone`` fits in the tangent plane with chord lengths, whatever its lift, and is nearly exact on spheres. The
+    fits are made in float64 on the host, once for each surface; while a JAX transformation is tracing the surface they
+    are made in the widest float that is switched on, and in float32 they lose their accuracy at vertices whose edges
+    differ in length by more than three hundred times. Differentiable in the vertices, but for the principal directions
+    where both curvatures are equal. At a crease or a corner the curvature of the surface is not a number but a measure,
+    and the fit gives values that grow as the mesh is refined: take `polyhedral_curvature` there, and where the integral
+    has to be exact.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -52,8 +55,12 @@ def curvature(surface: Surface) -> Curvature:
     Raises:
         ValueError: `Paper` has no second derivatives of its own.
     """
-    frames = surface.geometry.frames
-    xx, xy, yy = _bending(surface) if isinstance(surface.scheme, Monotone) else _bending_of_positions(surface)
+    return _curvature(surface, _bending(surface))
+
+
+@eqx.filter_jit
+def _curvature(surface: Surface, bending: Float[Array, "3 V"]) -> Curvature:
+    frames, (xx, xy, yy) = surface.geometry.frames, bending
     mean, gauss = (xx + yy) / 2, xx * yy - xy**2
     half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
     # Where both curvatures are equal the root has no derivative and the angle no value: any will do.
@@ -73,17 +80,32 @@ def curvature(surface: Surface) -> Curvature:
 
 
 def _bending(surface: Surface) -> Float[Array, "3 V"]:
-    """The second fundamental form xx, xy, yy in the frames, from quadratic fits with chord lengths, which are exact on
-    spheres whose normals are; in the widest float that JAX has switched on, and cast last."""
-    wide = jnp.promote_types(jnp.result_type(float), surface.dtype)
-    vertices, normals, frames = (x.astype(wide) for x in (surface.vertices, surface.normals, surface.geometry.frames))
+    """The second fundamental form xx, xy, yy in the frames."""
+    if not isinstance(surface.scheme, Monotone):
+        return _bending_of_positions(surface)
+    table, places = surface.topology.jet, (surface.vertices, surface.normals, surface.geometry.frames)
+    if surface.is_traced:
+        wide = jnp.promote_types(jnp.result_type(float), surface.dtype)
+        return _bending_of_heights(table, *(x.astype(wide) for x in places)).astype(surface.dtype)
+
+    def on_the_host():
+        host, *numbers = jax.device_get((table, *places))
+        return _bending_of_heights(host, *(x.astype(np.float64) for x in numbers))
+
+    return jnp.asarray(surface.remembered("bending", on_the_host), surface.dtype)
+
+
+def _bending_of_heights(
+    table: Table, vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], frames: Float[AnyArray, "V 2 3"]
+) -> Float[AnyArray, "3 V"]:
+    """From quadratic fits of heights over chord lengths. Exact on a sphere if the normals are."""
 
     def bending(block):
         seen = offsets(vertices, block)
         weights = jet_weights(lifted_ring(seen, block.centre(frames), "chord"), 2)
         return -height_jet(seen, block.centre(normals), weights)[2:].T
 
-    return surface.topology.jet.map(bending).T.astype(surface.dtype)
+    return table.map(bending).T
 
 
 def _bending_of_positions(surface: Surface) -> Float[Array, "3 V"]:

@@ -180,7 +180,6 @@ def vector_laplacian(
     return from_frame(surface, along(to_frame(surface, X)))
 
 
-@eqx.filter_jit
 def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """grad div X + n x grad curl X, the Laplacian that takes the gradient of u to that of Delta u; sign as `laplacian`.
 
@@ -193,7 +192,12 @@ def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Arr
 
     Source: Petersen (2016), Riemannian Geometry, doi:10.1007/978-3-319-26654-1, section 9.3.
     """
-    gauss, is_creased = curvature(surface).gauss, surface.topology.is_creased
+    return _hodge_laplacian(surface, curvature(surface).gauss, X)
+
+
+@eqx.filter_jit
+def _hodge_laplacian(surface: Surface, gauss: Array, X: AnyArray) -> Array:
+    is_creased = surface.topology.is_creased
     if is_creased is not None:
         gauss = jnp.where(is_creased, polyhedral_curvature(surface).gauss, gauss)
     return vector_laplacian(surface, X) - _beside(gauss, X) * tangential(surface, X)

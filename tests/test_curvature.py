@@ -66,3 +66,17 @@ def test_the_fitted_curvature_of_a_sphere_is_nearly_exact_whatever_the_lift(lift
     found = ltl.curvature(surface)
     np.testing.assert_allclose(found.mean, 1, atol=1e-4)
     np.testing.assert_allclose(found.gauss, 1, atol=1e-4)
+
+
+@pytest.mark.parametrize("ratio", [1e-2, 1e-4])
+def test_curvature_is_accurate_in_float32_beside_a_very_short_edge(ratio):
+    mesh = ltl.shapes.jittered_sphere(2, 0.4, seed=0)
+    vertices, (v, w) = mesh.vertices.copy(), mesh.edges[10]
+    vertices[w] = vertices[v] + ratio * (vertices[w] - vertices[v])
+    vertices[w] /= np.linalg.norm(vertices[w])
+    with jax.enable_x64(False):
+        surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, mesh.faces, normals=vertices))
+        found = ltl.curvature(surface)
+    assert surface.dtype == jnp.float32
+    np.testing.assert_allclose(found.mean, 1, atol=1e-3)
+    np.testing.assert_allclose(found.gauss, 1, atol=2e-3)

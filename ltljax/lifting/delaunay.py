@@ -46,8 +46,9 @@ def delaunay_triangulation(
     """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
 
     Every round flips a set of edges that do not share a face, those first whose opposite angles exceed pi the most, and
-    looks again at the edges around them. Edges between two vertices marked in ``is_folded`` (V,) stay, so that no edge
-    leads through a face that is folded over.
+    looks again at the edges around them. Edges between two vertices marked in ``is_folded`` (V,), which are the corners
+    of faces that are folded over and their neighbours, stay, so that no edge leads through such a face. All edges at
+    other vertices are Delaunay, which keeps the cotangent weights there non-negative.
     """
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()

@@ -196,7 +196,7 @@ def _products(a: Float[AnyArray, "I K N"], b: Float[AnyArray, "R K N"]) -> Float
     """The sums over k of a[i, k] b[r, k], for every vertex at once."""
     if isinstance(a, np.ndarray):
         return np.einsum("ikn,rkn->rin", a, b)
-    # XLA fuses the sum with what surrounds it; a batched matrix product takes three times as long.
+    # XLA fuses the sum with what surrounds it; on CPU a batched matrix product takes three times as long.
     return jnp.sum(a[None] * b[:, None], axis=2)
 
 

@@ -2,8 +2,9 @@
 
 Tables are slot-major: ``indices[k, v]`` is the neighbour of vertex v in slot k. An empty slot holds v's own index and
 weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few rows longer than
-most do not widen the table: the bulk has the width that costs the least memory, and longer rows live in tail blocks
-whose widths about double. Small tail blocks are joined, at a cost of at most a twentieth of the bulk.
+most do not widen the table: the bulk has the width that costs the least memory, and longer rows live in tail blocks,
+of which at most half is padding. Small ones are then joined with the next wider, which adds at most a twentieth of the
+bulk.
 
 A table can carry its reverse: for every vertex, the rows that use it. With it a transposed sum gathers, where the plain
 transpose of a gather would scatter, which is several times slower.
