@@ -419,6 +419,14 @@ def test_the_derivative_of_an_eigenvalue_in_the_shape_agrees_with_differences():
     np.testing.assert_allclose(slopes[1:], (up - down)[1:] / (2 * step), rtol=1e-4)
 
 
+def test_modes_of_large_multiplets_are_real_and_biorthonormal():
+    # The mesh splits multiplets into pairs, real and complex, whose real parts agree to rounding.
+    modes = ltl.eigenmodes(ltl.Surface.from_mesh(ltl.shapes.icosphere(4)), 81)
+    degrees = np.repeat(np.arange(9), 2 * np.arange(9) + 1)
+    np.testing.assert_allclose(modes.values, degrees * (degrees + 1), rtol=0.03, atol=1e-9)
+    np.testing.assert_allclose(modes.left.T @ modes.vectors, np.eye(81), atol=1e-12)
+
+
 @pytest.mark.parametrize("make", [ltl.shapes.icosphere, lambda n: ltl.shapes.jittered_sphere(n, 0.4, seed=0)])
 def test_geodesic_distance_converges_on_the_sphere(make):
     errors = []

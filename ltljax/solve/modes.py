@@ -93,13 +93,10 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
 def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The k eigenvalues next to zero with right and left vectors, real, biorthonormal."""
     values: Any
-    vectors: Any
     if matrix.shape[0] <= _DENSE:
         values, vectors = np.linalg.eig(matrix.toarray())
-        order = np.lexsort((-values.imag, values.real))[:k]
-        values, right = values[order], vectors[:, order]
-        left = np.linalg.inv(vectors).T[:, order]
-        return values.real, *_real(values, right, left)
+        values, right = _real(values, vectors)
+        return values[:k], right[:, :k], np.linalg.inv(right).T[:, :k]
     shift = -scale
     factors = scipy.sparse.linalg.splu(
         scipy.sparse.csc_matrix(matrix - shift * scipy.sparse.eye_array(matrix.shape[0]))
@@ -116,23 +113,21 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
         )  # fmt: skip
         options: Any = dict(k=count, sigma=shift, OPinv=inverse, v0=start, ncv=max(2 * count + 1, 20))
         pairs: Any = scipy.sparse.linalg.eigs(scipy.sparse.csc_array(transposed), **options)
-        values, vectors = pairs
-        order = np.lexsort((-values.imag, values.real))[:k]
-        found.append((values[order], vectors[:, order]))
+        found.append(_real(*pairs))
     (values, right), (_, left) = found
-    right, left = _real(values, right, left)
-    return values.real, right, left
+    left = left @ np.linalg.inv(right.T @ left)
+    return values[:k], right[:, :k], left[:, :k]
 
 
-def _real(values: Any, right: Any, left: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Real vectors of the same spaces: of a pair that is complex by discretisation, its real and imaginary part."""
-
-    def real(vectors):
-        out = vectors.real.copy()
-        for i in np.flatnonzero(values.imag > 0):  # its conjugate comes next
-            if i + 1 < len(values):
-                out[:, i + 1] = vectors[:, i].imag
-        return out / np.linalg.norm(out, axis=0)
-
-    right, left = real(right), real(left)
-    return right, left @ np.linalg.inv(right.T @ left)
+def _real(values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Real eigenvalues, ascending, and vectors of the same spaces: of a pair that is complex by discretisation its real
+    and its imaginary part."""
+    out, is_free = vectors.real.copy(), values.imag < 0
+    for i in np.flatnonzero(values.imag > 0):
+        distance = np.where(is_free, np.abs(values - values[i].conj()), np.inf)
+        partner = int(np.argmin(distance))
+        # Of a pair that is cut there is one.
+        if distance[partner] <= 1e-6 * np.abs(values[i]):
+            out[:, partner], is_free[partner] = vectors[:, i].imag, False
+    order = np.argsort(values.real, kind="stable")
+    return values.real[order], (out / np.linalg.norm(out, axis=0))[:, order]
