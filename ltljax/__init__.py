@@ -58,6 +58,7 @@ from .operators import (
     laplacian,
     laplacian_matrix,
     spectral_bound,
+    spectral_width,
     weighted_laplacian,
 )
 from .show import displaced, plot, plot_dispersion, view
@@ -219,6 +220,7 @@ __all__ = [
     "smoothness",
     "solve",
     "spectral_bound",
+    "spectral_width",
     "steady_state",
     "tangential",
     "tensor_laplacian",

@@ -70,6 +70,11 @@ class EllipticStencil(eqx.Module):
         """An upper bound of the magnitude of the eigenvalues, by Gershgorin's discs."""
         return 2 * jnp.max(slot_sum(self.table, self.weights))
 
+    def spectral_width(self) -> Float[Array, ""]:
+        """How far eigenvalues lie off the real axis, as `ltl.spectral_width` has it: half the mean row sum, which is
+        more than the stencils of random points have."""
+        return jnp.mean(slot_sum(self.table, self.weights)) / 2
+
     def with_coefficients(
         self, surface: Surface, diffusion: AnyArray | float, drift: AnyArray | None = None
     ) -> "EllipticStencil":

@@ -22,6 +22,10 @@ from .tables import AnyArray, difference_matrix, difference_sum, differences, sl
 # Below this size all eigenvalues are computed at once.
 _DENSE = 300
 
+# Products from which the rim of a spectrum is estimated, and what the estimate is multiplied with.
+_PRODUCTS = 60
+_MARGIN = 1.5
+
 
 @eqx.filter_jit
 def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3"]:
@@ -254,6 +258,53 @@ def spectral_bound(surface: Surface) -> Float[Array, ""]:
     steep = sum(slot_sum(topology.jet, size(weights)) for weights in geometry.gradient_weights)
     spread = sum(slot_sum(topology.jet, size(weights)) for weights in geometry.divergence_weights)
     return (2 * jnp.max(spread) + jnp.max(jnp.abs(geometry.divergence_centre))) * 2 * jnp.max(steep)
+
+
+def spectral_width(surface: Surface) -> Float[Array, ""]:
+    """How far the Laplacian's eigenvalues lie off the real axis: a number chi, per unit time at diffusivity 1, such
+    that each eigenvalue of negative real part has ``|Im|^2 <= chi |Re|``.
+
+    Rows of the Laplacian are not symmetric where a mesh is not. Explicit steps of length dt have to be stable inside
+    this parabola, so that the number of their stages follows from ``dt * chi`` too.
+
+    It is measured once for each surface (host), by Arnoldi iteration, whose first eigenvalues are those at the rim of
+    the spectrum, and half as much again is added. Where a JAX transformation is tracing a surface that was not
+    measured before, it is half the mean row sum, which is more than random points need.
+    """
+    if surface.geometry.spectral_width is not None:
+        return surface.geometry.spectral_width
+    if not surface.is_traced:
+        width = surface.remembered("spectral width", lambda: _measured_width(surface))
+        return jnp.asarray(width, surface.dtype)
+    weights = surface.geometry.laplacian_weights
+    if surface.topology.diffusion is None or weights is None:
+        return spectral_bound(surface) / 2
+    return jnp.mean(slot_sum(surface.topology.diffusion, weights)) / 2
+
+
+def _measured_width(surface: Surface) -> float:
+    # In the inner product of the areas eigenvectors are nearly orthogonal.
+    scale = np.sqrt(np.asarray(surface.vertex_areas, np.float64))
+    matrix: Any = scipy.sparse.diags_array(scale) @ laplacian_matrix(surface) @ scipy.sparse.diags_array(1 / scale)
+    count = min(_PRODUCTS, surface.num_vertices)
+    basis, hessenberg = np.zeros((count + 1, surface.num_vertices)), np.zeros((count + 1, count))
+    start = np.random.default_rng(0).normal(size=surface.num_vertices)
+    basis[0] = start / np.linalg.norm(start)
+    for k in range(count):
+        new = matrix @ basis[k]
+        size = np.linalg.norm(new)
+        for _ in range(2):  # the second time for rounding
+            along = basis[: k + 1] @ new
+            hessenberg[: k + 1, k] += along
+            new -= along @ basis[: k + 1]
+        hessenberg[k + 1, k] = np.linalg.norm(new)
+        if hessenberg[k + 1, k] <= 1e-12 * size:
+            count = k + 1
+            break
+        basis[k + 1] = new / hessenberg[k + 1, k]
+    values = np.linalg.eigvals(hessenberg[:count, :count])
+    values = values[values.real < -1e-12 * np.abs(values).max()]
+    return _MARGIN * float(np.max(values.imag**2 / -values.real, initial=0))
 
 
 def _gradient_in_frame(surface: Surface, u: Array) -> tuple[Array, Array]:

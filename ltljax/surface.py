@@ -23,7 +23,7 @@ from .construction import SurfaceReport, freeze, warn_of_rows, with_reverse
 from .lifting.schemes import Geometry, Monotone, Scheme, Topology, weigh
 from .mesh import Mesh
 from .progress import Laps, watched
-from .tables import AnyArray, difference_matrix
+from .tables import AnyArray, difference_matrix, slot_sum
 
 
 class Surface(eqx.Module):
@@ -60,7 +60,7 @@ class Surface(eqx.Module):
         Raises:
             TypeError: no mesh was given.
             ValueError: the dtype is no float, or is float64 while JAX has 64-bit numbers switched off, or the mesh is
-                so small that its weights leave the range of the dtype.
+                so small or large that its weights leave the range of the dtype.
 
         Warns:
             InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row and could not use
@@ -83,9 +83,9 @@ class Surface(eqx.Module):
         with np.errstate(over="ignore"):  # an overflow of the cast is found below
             geometry = weigh(scheme, mesh.vertices, topology, angles)
             geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), geometry)
-        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry)):
+        if not _is_in_range(geometry):
             raise ValueError(
-                f"Weights grow like 1 / length^2, and at a mesh size of {mesh.mesh_size:.3g} they leave the range of "
+                f"Weights go with 1 / length^2, and at a mesh size of {mesh.mesh_size:.3g} they leave the range of "
                 f"{jnp.dtype(dtype).name}. Rescale the mesh (mesh.scaled(factor)) or use float64."
             )
         warn_of_rows(report, scheme, stacklevel=2)
@@ -107,7 +107,15 @@ class Surface(eqx.Module):
         vertices = jnp.asarray(vertices, _float_dtype(None))
         geometry = _weigh(self.scheme, vertices, self.topology)
         geometry = jax.tree.map(lambda leaf: leaf.astype(self.dtype), geometry)
+        geometry = dataclasses.replace(geometry, spectral_width=self._width_in_proportion(geometry))
         return eqx.tree_at(lambda surface: surface.geometry, self, geometry)
+
+    def _width_in_proportion(self, geometry: Geometry) -> Array | None:
+        """The spectral width of the moved surface: it is measured once, and grows like the rows."""
+        table, width, weights = self.topology.diffusion, self.geometry.spectral_width, self.geometry.laplacian_weights
+        if table is None or width is None or weights is None or geometry.laplacian_weights is None:
+            return None
+        return width * jnp.mean(slot_sum(table, geometry.laplacian_weights)) / jnp.mean(slot_sum(table, weights))
 
     @property
     def vertices(self) -> Float[Array, "V 3"]:
@@ -195,6 +203,14 @@ _weigh = eqx.filter_jit(weigh)
 
 # Results on the host, by the identity of the weights they belong to, for as long as those live.
 _REMEMBERED: dict[int, dict[str, Any]] = {}
+
+
+def _is_in_range(geometry: Geometry) -> bool:
+    """Whether all numbers are finite, and those that go with the squared length large enough to have all digits."""
+    squares = jax.tree.leaves((geometry.laplacian_weights, geometry.hessian_weights, geometry.vertex_areas))
+    is_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry))
+    least = np.finfo(squares[0].dtype).tiny / np.finfo(squares[0].dtype).eps
+    return is_finite and all(leaf.size == 0 or np.abs(leaf).max() > least for leaf in squares)
 
 
 def _float_dtype(dtype):

@@ -1,4 +1,4 @@
-"""Linear systems and what is made of them: multigrid, Poisson, stationary states, eigenmodes, geodesic distance."""
+"""Linear systems and what is made of them: multigrid, Poisson, stationary states, eigenmodes."""
 
 import gc
 import warnings
@@ -425,46 +425,6 @@ def test_modes_of_large_multiplets_are_real_and_biorthonormal():
     degrees = np.repeat(np.arange(9), 2 * np.arange(9) + 1)
     np.testing.assert_allclose(modes.values, degrees * (degrees + 1), rtol=0.03, atol=1e-9)
     np.testing.assert_allclose(modes.left.T @ modes.vectors, np.eye(81), atol=1e-12)
-
-
-@pytest.mark.parametrize("make", [ltl.shapes.icosphere, lambda n: ltl.shapes.jittered_sphere(n, 0.4, seed=0)])
-def test_geodesic_distance_converges_on_the_sphere(make):
-    errors = []
-    for level in (3, 4):
-        surface = ltl.Surface.from_mesh(make(level))
-        exact = jnp.arccos(jnp.clip(surface.vertices @ surface.vertices[0], -1, 1))
-        errors.append(jnp.max(jnp.abs(ltl.geodesic_distance(surface, 0) - exact)))
-    assert errors[1] < 0.05
-    assert errors[1] < 0.6 * errors[0]
-
-
-def test_distance_does_not_rest_on_rounding_where_shortest_paths_meet():
-    # At the far pole the heat has a minimum, and rounding alone would choose a direction.
-    mesh = ltl.shapes.icosphere(3)
-    shift = 1e-15 * np.random.default_rng(0).normal(size=mesh.vertices.shape)
-    found, other = (
-        ltl.geodesic_distance(ltl.Surface.from_mesh(ltl.Mesh(x, mesh.faces)), 0)
-        for x in (mesh.vertices, mesh.vertices + shift)
-    )
-    np.testing.assert_allclose(found, other, atol=1e-8)
-
-
-def test_distance_from_several_sources_is_that_from_the_nearest():
-    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
-    poles = [int(jnp.argmax(surface.vertices[:, 2])), int(jnp.argmin(surface.vertices[:, 2]))]
-    exact = jnp.arccos(jnp.clip(jnp.abs(surface.vertices[:, 2]), 0, 1))
-    assert jnp.max(jnp.abs(ltl.geodesic_distance(surface, poles) - exact)) < 0.06
-    apart = ltl.Surface.from_mesh(two_spheres(3))
-    alone = ltl.geodesic_distance(ltl.Surface.from_mesh(ltl.shapes.icosphere(3)), 0)
-    size = len(alone)
-    found = ltl.geodesic_distance(apart, 0)
-    np.testing.assert_allclose(found[:size], alone, atol=1e-6)
-    assert jnp.isinf(found[size:]).all()
-    both = ltl.geodesic_distance(apart, [0, size])
-    # Near the far pole the direction rests on rounding.
-    np.testing.assert_allclose(both, np.tile(alone, 2), atol=0.03)
-    with pytest.raises(ValueError, match="source vertices from 0"):
-        ltl.geodesic_distance(surface, [10**6])
 
 
 def test_what_is_not_solvable_is_said(sphere):

@@ -1,11 +1,13 @@
 """What every equation answers: its rate of change, and how stiff it is."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..operators import spectral_bound, spectral_width
 from ..surface import Surface
 from .boundary import Condition
 
@@ -25,6 +27,12 @@ class Equation(eqx.Module):
     def spectral_bound(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
         """An upper bound of the magnitude of the eigenvalues of the rate's derivative at the state."""
 
+    def spectral_width(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
+        """How far those eigenvalues lie off the real axis, as `ltl.spectral_width` has it; by default as far as the
+        Laplacian's, in proportion to the bounds."""
+        bound = self.spectral_bound(t, surface, u)
+        return bound * (spectral_width(surface) / spectral_bound(surface)).astype(bound.dtype)
+
     def explicit_rate(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
         """The part of the rate that is not stiff; what remains, `implicit_rate`, must be affine in u."""
         raise NotImplementedError(
@@ -41,6 +49,11 @@ class Equation(eqx.Module):
         return jnp.zeros(u.shape[1:], u.dtype)
 
     @property
+    def size(self) -> Callable[[Array], Array]:
+        """``u -> sizes (S,)``, the largest magnitude of each species of a state, which tolerances are relative to."""
+        return _largest
+
+    @property
     def is_affine(self) -> bool:
         """Whether the rate is affine in u."""
         return False
@@ -54,3 +67,7 @@ class Equation(eqx.Module):
     def conditions(self) -> tuple[Condition, ...]:
         """The boundary conditions."""
         return ()
+
+
+def _largest(u: Array) -> Array:
+    return jnp.max(jnp.abs(u), axis=0)

@@ -64,6 +64,15 @@ class Moving(Equation):
         bound = self.equation.spectral_bound(t, self.surface_at(t, surface), u)
         return bound + jnp.max(jnp.abs(self.dilution(t, surface)))
 
+    def spectral_width(self, t, surface: Surface, u):
+        """The equation's width on the surface of this time."""
+        return self.equation.spectral_width(t, self.surface_at(t, surface), u)
+
+    @property
+    def size(self):
+        """The equation's own."""
+        return self.equation.size
+
     def held(self, t, surface: Surface, u):
         """The state with the values that the equation holds."""
         return self.equation.held(t, self.surface_at(t, surface), u)

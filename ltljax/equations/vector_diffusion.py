@@ -72,6 +72,11 @@ class VectorDiffusion(Equation):
         """Whether there is no reaction."""
         return self.reaction is None
 
+    @property
+    def size(self):
+        """Of each vector field the largest magnitude of its components, in whichever direction."""
+        return _largest
+
     def held(self, t, surface: Surface, u):
         """The tangent part of the state."""
         del t
@@ -87,3 +92,7 @@ class VectorDiffusion(Equation):
         axes = jnp.eye(3, dtype=u.dtype)
         columns = [jax.jvp(rate, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in axes]
         return bound + jnp.max(sum(jnp.abs(column) for column in columns))
+
+
+def _largest(u: Array) -> Array:
+    return jnp.broadcast_to(jnp.max(jnp.abs(u), axis=(0, -1), keepdims=True)[0], u.shape[1:])

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..equations import Equation
+from ..mesh.arguments import as_numbers
 from ..solve import Multigrid, Solution, solve
 from ..surface import Surface
 from ..tables import AnyArray
@@ -45,6 +46,8 @@ class Observations(eqx.Module):
         species: int | tuple[int, ...] | None = None,
     ):
         dtype = jnp.result_type(float)
+        for name, given in (("values", values), ("noise", noise), ("times", times)):
+            as_numbers(name, given)
         self.values = jnp.asarray(values, dtype)
         host = np.asarray(self.values)
         if host.size == 0:
@@ -165,7 +168,7 @@ class Experiment(eqx.Module):
     solver: diffrax.AbstractSolver | None = None
     dt: float | None = None
     rtol: float = 1e-5
-    atol: float = 1e-7
+    atol: float | None = None
     max_steps: int = 100_000
     preconditioner: Multigrid | None = None
 

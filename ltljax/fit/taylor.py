@@ -51,9 +51,10 @@ def check_gradient(
     """Taylor's test of ``jax.grad(loss)`` at some parameters (host).
 
     If the gradient is right the remainder of the linear prediction falls like the square of the step: slope 2. Slope 1
-    says it is wrong (or the function has a kink there); no slope at all says that the loss is noisy, mostly because
-    adaptive steps or an iteration end at different places, which tighter tolerances cure. A loss that does not answer
-    to the steps beyond its rounding shows nothing, and does not pass.
+    says it is wrong (or the function has a kink there), or right to a share that is said, which is what adaptive steps
+    leave: their lengths count as given in a gradient. With `solve(..., dt=...)` the slope is 2. No slope at all says
+    that the loss is noisy, mostly because adaptive steps or an iteration end at different places, which tighter
+    tolerances cure. A loss that does not answer to the steps beyond its rounding shows nothing, and does not pass.
 
     Args:
         loss: ``params -> number``, differentiable in reverse mode.
@@ -114,8 +115,9 @@ def _verdict(slope: float, derivative: float, share: float) -> str:
         return f"In doubt: slope {slope:.2f} instead of 2. Take a smaller step=, or tighter tolerances."
     if slope > 0.7 and share < _NEARLY:
         return (
-            f"The gradient is right to {100 * share:.1g} %, no better: slope {slope:.2f} instead of 2. Adaptive steps "
-            "err differently for other parameters: tighten rtol and atol, or give dt= for fixed steps."
+            f"The gradient is right to {100 * share:.1g} %, no better: slope {slope:.2f} instead of 2. So it is with "
+            "adaptive steps, whose lengths a gradient takes as given while they change with the parameters: what is "
+            "left is of the size of their error. Tighten rtol, or give dt= for fixed steps, whose gradient is exact."
         )
     if slope > 0.7:
         return (

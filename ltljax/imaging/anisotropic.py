@@ -47,6 +47,11 @@ class AnisotropicDiffusion(Equation):
         del t, surface
         return self.stencil.spectral_bound().astype(u.dtype)
 
+    def spectral_width(self, t, surface: Surface, u):
+        """That of the operator."""
+        del t, surface
+        return self.stencil.spectral_width().astype(u.dtype)
+
     def diffusivities(self, u):
         """The mean of the tensor's eigenvalues."""
         return jnp.broadcast_to(self.stencil.mean_diffusion.astype(u.dtype), u.shape[1:])

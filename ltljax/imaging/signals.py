@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from ..mesh.arguments import as_numbers
 from ..solve.evolve import SolveError
 from ..surface import Surface
 from ..tables import AnyArray
@@ -23,6 +24,7 @@ def signal(surface: Surface, u: AnyArray, name: str = "u") -> Float[Array, "V *C
         ValueError: it does not fit the surface, or is not finite.
     """
     size = surface.num_vertices
+    as_numbers(name, u)
     if jnp.ndim(u) not in (1, 2) or jnp.shape(u)[0] != size:
         raise ValueError(
             f"Expected {name} of shape ({size},) or ({size}, C), one row for each vertex, found {jnp.shape(u)}."

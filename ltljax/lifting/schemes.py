@@ -153,6 +153,7 @@ class Geometry(eqx.Module):
         directions: lengths and directions in the charts of the vertices; None where all rows are laid out in space.
         conormals: (B, 2, 3) the outward conormals of both sides of each boundary vertex, equal where it is smooth.
         flux_weights: (B, 2) what a unit flux through each side adds to the Laplacian there; None without such rows.
+        spectral_width: how far the Laplacian's eigenvalues lie off the real axis, where that was measured.
     """
 
     vertices: Float[AnyArray, "V 3"]
@@ -169,6 +170,7 @@ class Geometry(eqx.Module):
     directions: Directions | None
     conormals: Float[AnyArray, "B 2 3"]
     flux_weights: Float[AnyArray, "B 2"] | None
+    spectral_width: Float[AnyArray, ""] | None = None
 
 
 # The sine of the angle between two conormals below which they count as one.

@@ -1,7 +1,29 @@
-"""Are the sizes and counts of a shape usable? Numbers enter; numbers or a sentence leave."""
+"""Are sizes, counts and arrays usable? Numbers enter; numbers or a sentence leave."""
 
 import operator
 from typing import Any
+
+import numpy as np
+
+
+def as_numbers(name: str, value: Any) -> Any:
+    """The value, if as an array of real numbers it loses nothing.
+
+    Raises:
+        ValueError: it is a masked array, or one of dates, text, complex numbers or objects.
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(
+            f"Expected {name} as a plain array, found a masked one, whose mask would be lost. Fill it with "
+            "values.filled(...), or leave out what is masked."
+        )
+    if isinstance(value, list | tuple):
+        for item in value:
+            as_numbers(name, item)
+    elif isinstance(value, np.ndarray | np.generic | str | bytes) and np.asarray(value).dtype.kind not in "biuf":
+        kind = np.asarray(value).dtype
+        raise ValueError(f"Expected {name} as real numbers, found the type {kind}. Convert it with astype(float).")
+    return value
 
 
 def at_least(name: str, value: Any, least: int, most: int | None = None) -> int:

@@ -103,6 +103,12 @@ def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
 
 def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     """The arguments as float64 (V, 3) and int64 (F, 3)."""
+    for name, array in (("vertices", vertices), ("faces", faces)):
+        if isinstance(array, np.ma.MaskedArray):
+            raise MeshError(
+                f"Expected {name} as a plain array, found a masked one, whose mask would be lost. Leave out what is "
+                "masked, and the faces there."
+            )
     try:
         vertices, faces = np.asarray(vertices), np.asarray(faces)
     except (TypeError, ValueError) as error:

@@ -24,7 +24,7 @@ class Settings:
         dtype: ``"float32"`` or ``"float64"``.
         solver: as of `solve`; None for its default.
         rtol: relative tolerance.
-        atol: absolute tolerance.
+        atol: absolute tolerance; None for what `solve` takes by itself.
         dt: the length of fixed steps; None for adaptive ones.
         show: the species that pictures show.
         colormap: the name of their colours.
@@ -37,7 +37,7 @@ class Settings:
     dtype: str = "float64"
     solver: diffrax.AbstractSolver | None = None
     rtol: float = 1e-4
-    atol: float = 1e-6
+    atol: float | None = None
     dt: float | None = None
     show: str = "u"
     colormap: str = "viridis"

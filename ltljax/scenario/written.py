@@ -460,7 +460,7 @@ def _settings(root: Table, species: tuple[str, ...]) -> Settings:
         dtype=solver.choice("dtype", ("float32", "float64"), "float64"),
         solver=None if name == "RKL2" else SOLVERS[name](),
         rtol=solver.number("rtol", 1e-4, 1e-14, 1e-1),
-        atol=solver.number("atol", 1e-6, 1e-16, 1.0),
+        atol=solver.number("atol", 1e-6, 1e-16, 1.0) if "atol" in solver else None,
         dt=dt or None,
         show=output.choice("show", species, species[0]),
         colormap=output.choice("colormap", tuple(COLORMAPS), "viridis"),

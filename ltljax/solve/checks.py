@@ -1,5 +1,7 @@
 """What is wrong with a run before it starts: each mistake one clear error (host)."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,20 @@ from jaxtyping import Array, ArrayLike
 
 from ..elliptic import EllipticStencil
 from ..equations import Equation
+from ..mesh.arguments import as_numbers
 from ..surface import Surface
 from ..tables import AnyArray
 from .stabilised import Stabilised
 
 # Products with the rate's derivative from which the stiffest mode is estimated.
 _PRODUCTS = 30
+
+
+def field(surface: Surface, u: Any, name: str) -> Array:
+    """A field over a surface as an array (V,) or (V, S) in its float type, if it is one."""
+    u = jnp.asarray(as_numbers(name, u), surface.dtype)
+    state(surface, u)
+    return u
 
 
 def state(surface: Surface, u0: Array) -> None:
@@ -50,9 +60,11 @@ def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
         )
 
 
-def tolerances(rtol: ArrayLike, atol: ArrayLike) -> None:
+def tolerances(rtol: ArrayLike, atol: ArrayLike | None) -> None:
     """Raise where tolerances are not positive."""
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
+        if tolerance is None:
+            continue
         if not isinstance(tolerance, Tracer) and not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) > 0)):
             raise ValueError(
                 f"Expected a positive tolerance, found {name} = {tolerance}: steps would have to be without error. For "
@@ -101,20 +113,20 @@ def step(
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, dt))):
         return
     # What is traced may be reached through a closure too.
+    t0 = jnp.asarray(t0, u0.dtype)
     if isinstance(solver, Stabilised):
-        bound = solver.spectral_bound(jnp.asarray(t0, u0.dtype), u0, (equation, surface))
-        if not isinstance(bound, Tracer) and dt > (longest := solver.longest_step(float(bound))):
-            raise ValueError(
-                f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {longest:.2g} with the "
-                "most stages it takes. Take shorter steps, leave dt out for adaptive ones, or use ltl.TRBDF2()."
-            )
-    if not isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
+        longest, others = solver.longest_step(solver.extent(t0, u0, (equation, surface))), "ltl.TRBDF2()"
+    elif isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
+        stiffest, width = _stiffest(equation, surface, u0, t0), equation.spectral_width(t0, surface, u0)
+        if isinstance(stiffest, Tracer) or isinstance(width, Tracer):
+            return
+        longest, others = 1.02 * longest_step(solver, float(stiffest), float(width)), "ltl.RKL2() or ltl.TRBDF2()"
+    else:
         return
-    reach, stiffest = real_stability(solver), _stiffest(equation, surface, u0, jnp.asarray(t0, u0.dtype))
-    if not isinstance(stiffest, Tracer) and dt > 1.02 * (longest := reach / max(float(stiffest), 1e-30)):
+    if not isinstance(longest, Tracer) and dt > longest:
         raise ValueError(
-            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {longest:.2g} on "
-            "this surface. Take shorter steps, leave dt out for adaptive ones, or use ltl.RKL2() or ltl.TRBDF2()."
+            f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {float(longest):.2g} on "
+            f"this surface. Take shorter steps, leave dt out for adaptive ones, or use {others}."
         )
 
 
@@ -133,20 +145,32 @@ def _stiffest(equation: Equation, surface: Surface, u0: Array, t0: Array) -> Arr
     return _power_iteration(equation, surface, u0, t0, start)
 
 
-def real_stability(solver: diffrax.AbstractSolver) -> float:
-    """How far along the negative real axis an explicit Runge-Kutta method is stable."""
+def longest_step(solver: diffrax.AbstractSolver, bound: float, width: float) -> float:
+    """The longest step with which an explicit Runge-Kutta method is stable where eigenvalues x + iy have ``-bound <= x
+    <= 0`` and ``y^2 <= width |x|``."""
+    growth = _growth(solver)
+    x = max(bound, 1e-30) * np.linspace(0, 1, 400)[1:]
+    eigenvalues = -x + 1j * np.sqrt(width * x) * np.linspace(0, 1, 21)[:, None]
+    reach = np.arange(1e-3, 50, 1e-3)
+    on_axis = reach[np.argmax(np.abs(growth(-reach)) > 1 + 1e-9)]
+    for length in on_axis / max(bound, 1e-30) * 0.95 ** np.arange(400):
+        if np.abs(growth(length * eigenvalues)).max() <= 1 + 1e-9:
+            return float(length)
+    return 0.0
+
+
+def _growth(solver: diffrax.AbstractSolver) -> np.polynomial.Polynomial:
+    """What a step of an explicit Runge-Kutta method multiplies exp(lambda t) with, as a polynomial of lambda dt."""
     if isinstance(solver, diffrax.Euler):
-        return 2.0
+        return np.polynomial.Polynomial([1, 1])
     tableau = solver.tableau  # type: ignore
     size = len(tableau.b_sol)
     a = np.zeros((size, size))
     for row, values in enumerate(tableau.a_lower, start=1):
         a[row, :row] = values
-    reach = np.arange(1e-3, 50, 1e-3)
-    # R(-x) = 1 - x b (I + x a)^-1 1, a polynomial since a is nilpotent.
-    moments, powers = [], np.ones(size)
+    # R(z) = 1 + z b (I - z a)^-1 1, a polynomial since a is nilpotent.
+    coefficients, powers = [1.0], np.ones(size)
     for _ in range(size):
-        moments.append(tableau.b_sol @ powers)
+        coefficients.append(tableau.b_sol @ powers)
         powers = a @ powers
-    growth = 1 + sum(moment * (-reach) ** (k + 1) for k, moment in enumerate(moments))
-    return float(reach[np.argmax(np.abs(growth) > 1 + 1e-9)])
+    return np.polynomial.Polynomial(coefficients)

@@ -1,78 +1,71 @@
-"""Geodesic distance by the heat method: a little diffusion, its direction, and the potential with that gradient."""
+"""Distances along a surface: fronts that are carried over unfolded triangles (host).
 
-import functools
-import math
-import warnings
+What enters: a surface and source vertices. What leaves: the distance of every vertex from the nearest of them. Only
+lengths of edges are seen, of the intrinsic Delaunay triangulation; how the surface bends in space plays no part.
+"""
+
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..operators import gradient, laplacian, laplacian_matrix
+from ..lifting.delaunay import HalfEdges, delaunay_triangulation
 from ..surface import Surface
 from ..tables import AnyArray
-from .stationary import IncompatibleSourceWarning, poisson
 
-# The heat at a distance d is about exp(-d / sqrt(time)); over the size of the surface it must not leave float64.
-_DECAY = 500
-# Times the slope of the logarithm of heat, 1 / sqrt(time): below it a descent is what rounding left where two shortest
-# paths meet, and has no direction.
-_NO_DIRECTION = 1e-3
+# A distance is corrected where it falls by more than this share, which is rounding.
+_ROUNDING = 1e-12
 
 
 def geodesic_distance(
-    surface: Surface, sources: Int[AnyArray, " n"] | Sequence[int] | int, time: float | None = None
+    surface: Surface,
+    sources: Int[AnyArray, " n"] | Sequence[int] | int,
+    method: Literal["marching", "exact"] = "marching",
 ) -> Float[Array, " V"]:
-    """The distance along the surface of every vertex from the nearest of some source vertices (host): first order.
+    """The distance along the surface of every vertex from the nearest of some source vertices (host).
 
-    One backward Euler step of heat from the sources, whose gradient points to them; the distance is the potential whose
-    gradient has that direction and length one. The heat is found by sparse elimination: with non-negative weights that
-    keeps its relative accuracy where it is tiny, which an iteration does not.
+    With ``"marching"`` a front moves on from vertex to vertex: two neighbours and their distances, unfolded into the
+    plane, show where the front came from as if from a single point, and so the distance of a third one beyond them.
+    Exact on what unfolds into a plane, such as strips, boxes between their corners, and rolled sheets; of first order
+    in the mean on curved surfaces, with an error a third of that of the heat method on spheres and a tenth on scans.
+
+    With ``"exact"`` the shortest paths on the polyhedron of the mesh, by libigl (``pip install libigl``), which takes
+    about a hundred times as long on large meshes.
 
     Args:
-        surface: a `Monotone` surface. On a component without a source the distance is infinite.
+        surface: a surface with any scheme. On a component without a source the distance is infinite.
         sources: indices of vertices.
-        time: of the step; by default the square of the mean distance of neighbours.
+        method: ``"marching"`` or ``"exact"``.
 
     Raises:
-        SolveError: the potential was not found.
-        ValueError: there are no sources, or not on the surface, the time is not positive, or the surface is being
-            traced.
+        ValueError: there are no sources, or not on the surface, or the surface is being traced, or the method is not
+            known.
+        ImportError: ``"exact"`` without libigl.
 
-    Source: Crane, Weischedel and Wardetzky (2013), Geodesics in heat, doi:10.1145/2516971.2516977.
+    Example:
+        >>> import ltljax as ltl
+        >>> surface = ltl.Surface.from_mesh(ltl.shapes.square(n=8))
+        >>> round(float(ltl.geodesic_distance(surface, 0)[-1]), 6)  # from corner to corner
+        1.414214
+
+    Source: Novotni and Klein (2002), Computing geodesic distances on triangular meshes, WSCG; for ``"exact"`` Mitchell,
+    Mount and Papadimitriou (1987), The discrete geodesic problem, doi:10.1137/0216045.
     """
     if surface.is_traced:
         raise ValueError(
             "The distance is computed on the host, but the surface is being traced by a JAX transformation."
         )
     sources = checked_sources(surface, sources)
-    if time is not None and not time > 0:
-        raise ValueError(f"Expected a positive time, found {time}.")
-    here = np.zeros(surface.num_vertices)
-    here[sources] = 1
-    step = shortest_step(surface) if time is None else time
-    stepped = scipy.sparse.eye_array(len(here)) - step * laplacian_matrix(surface).astype(np.float64)
-    # Without pivoting, so that nothing is ever subtracted.
-    factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(stepped), diag_pivot_thresh=0.0)
-    heat = np.maximum(factors.solve(here), np.finfo(np.float64).tiny)
-    # Of the logarithm, so that what is tiny stays in range in float32; the direction is the same.
-    descent = -gradient(surface, jnp.asarray(np.log(heat), surface.dtype))
-    is_source = jnp.asarray(here, surface.dtype)
-    with warnings.catch_warnings():
-        # Where the distance has kinks the mean is not that of a divergence.
-        warnings.simplefilter("ignore", IncompatibleSourceWarning)
-        distance = poisson(surface, _divergence(surface, math.sqrt(step) * descent, is_source))
-    # A potential is known up to a constant on every component.
-    components = np.asarray(surface.topology.components)
-    nearest = np.full(surface.topology.num_components, -np.inf)
-    for component in np.unique(components[sources]):
-        nearest[component] = np.asarray(distance)[sources[components[sources] == component]].min()
-    return distance - jnp.asarray(nearest[components], surface.dtype)
+    if method == "exact":
+        distance = _on_the_polyhedron(surface, sources)
+    elif method == "marching":
+        distance = _march(surface.remembered("windows", lambda: _windows(surface)), sources, surface.num_vertices)
+    else:
+        raise ValueError(f'Expected the method "marching" or "exact", found {method!r}.')
+    return jnp.asarray(distance, surface.dtype)
 
 
 def checked_sources(surface: Surface, sources: Any) -> np.ndarray:
@@ -87,23 +80,146 @@ def checked_sources(surface: Surface, sources: Any) -> np.ndarray:
     return sources
 
 
-def shortest_step(surface: Surface) -> float:
-    """The time of a step of heat that tells shortest paths (host): the squared mesh size, or what float64 can hold."""
-    diameter = float(np.linalg.norm(np.ptp(np.asarray(surface.vertices, np.float64), axis=0)))
-    return max(float(surface.mesh_size), 2 * diameter / _DECAY) ** 2
+class _Windows(NamedTuple):
+    """Pairs of vertices through which a front reaches a third one, W in all.
 
+    Places are in a plane in which the triangles between are unfolded and the vertex that is reached is at zero.
 
-@eqx.filter_jit
-def _divergence(surface: Surface, descent: Array, here: Array) -> Array:
-    """What the Laplacian makes of a potential that rises along edges as a unit field X in the direction of descent.
-
-    The descent is about one long where one shortest path arrives, and X is zero where it is almost none. That is
-    sum_k c_k (X_v + X_k) / 2 . (x_k - x_v); at the sources, where X has no direction, that of the other end of an edge
-    counts for both.
+    Attributes:
+        targets: (W,) the vertex that is reached.
+        ends: (2, W) the two vertices.
+        places: (2, W) where these are.
+        gap: (2, W) the ends of the edge that a path has to cross on its way; the two vertices themselves, or those of
+            the edge opposite the target.
+        order: (2 W,) the windows, sorted by the vertices they begin at; and ``starts`` (V + 1,) where each has its own.
+        mean_length: of the edges.
     """
-    x, L = surface.vertices, functools.partial(laplacian, surface)
-    size = jnp.sqrt(jnp.sum(descent**2, axis=-1, keepdims=True) + _NO_DIRECTION**2)
-    X = jnp.where(here[:, None] > 0, 0, descent / size)
-    rises = (jnp.sum(X * L(x), axis=-1) + L(jnp.sum(X * x, axis=-1)) - jnp.sum(L(X) * x, axis=-1)) / 2
-    to_source = jnp.sum(X * (L(here[:, None] * x) - L(here)[:, None] * x), axis=-1) / 2
-    return jnp.where(here > 0, 2 * rises, rises + to_source)
+
+    targets: Int[np.ndarray, " W"]
+    ends: Int[np.ndarray, "2 W"]
+    places: Complex[np.ndarray, "2 W"]
+    gap: Complex[np.ndarray, "2 W"]
+    order: Int[np.ndarray, " N"]
+    starts: Int[np.ndarray, " M"]
+    mean_length: float
+
+    def of(self, vertices: np.ndarray) -> np.ndarray:
+        """The windows that begin at some vertices, each once."""
+        counts = self.starts[vertices + 1] - self.starts[vertices]
+        first = np.repeat(self.starts[vertices] - np.cumsum(counts) + counts, counts)
+        return np.unique(self.order[first + np.arange(len(first))])
+
+
+def _windows(surface: Surface) -> _Windows:
+    """The windows of a surface: the edge opposite a vertex in each of its triangles, and the two edges behind that."""
+    topology, vertices = jax.device_get((surface.topology, surface.vertices))
+    is_folded = np.zeros(len(vertices), bool) if topology.is_extrinsic is None else topology.is_extrinsic
+    _, half_edges, _ = delaunay_triangulation(
+        topology.faces, vertices.astype(np.float64), topology.ring, topology.ring_blocks, is_folded
+    )
+    near, places, h = _opposite(half_edges)
+    across = h ^ 1
+    has_more = half_edges.following[across] >= 0
+    seen, gap, behind = near[:, has_more], places[:, has_more], across[has_more]
+    third, beyond = _beyond(half_edges, behind, gap)
+    targets = np.concatenate([near[2], seen[2], seen[2]])
+    ends = np.concatenate([near[:2], [seen[0], third], [third, seen[1]]], axis=1)
+    spots = np.concatenate([places, [gap[0], beyond], [beyond, gap[1]]], axis=1)
+    order = np.argsort(ends.ravel(), kind="stable")
+    starts = np.searchsorted(ends.ravel()[order], np.arange(surface.num_vertices + 1))
+    return _Windows(
+        targets, ends, spots, np.concatenate([places, gap, gap], axis=1), order % len(targets), starts,
+        float(half_edges.lengths.mean()),
+    )  # fmt: skip
+
+
+def _opposite(half_edges: HalfEdges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For every corner of a triangle the two other vertices and its own (3, N), where the two are with its own at zero
+    (2, N), and the half-edge between them (N,)."""
+    following, tails, lengths = half_edges.following, half_edges.tails, half_edges.lengths
+    h = np.flatnonzero(following >= 0)
+    ahead = following[h]
+    last = following[ahead]
+    opposite, right, left = lengths[h >> 1], lengths[last >> 1], lengths[ahead >> 1]
+    cosine = np.clip((left**2 + right**2 - opposite**2) / (2 * left * right), -1, 1)
+    places = np.stack([right.astype(complex), left * np.exp(1j * np.arccos(cosine))])
+    return np.stack([tails[h], tails[ahead], tails[last]]), places, h
+
+
+def _beyond(half_edges: HalfEdges, h: np.ndarray, gap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The third vertex of the triangles of half-edges that lead from ``gap[1]`` to ``gap[0]``, and where it is."""
+    ahead = half_edges.following[h]
+    last = half_edges.following[ahead]
+    from_first, from_second = half_edges.lengths[ahead >> 1], half_edges.lengths[last >> 1]
+    return half_edges.tails[last], _apex(gap, from_first, from_second)[0]
+
+
+def _apex(places: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The point at such distances from two places, on the side of them away from zero; and whether there is one."""
+    edge = places[1] - places[0]
+    length = np.maximum(np.abs(edge), np.finfo(float).tiny)
+    along = (first**2 - second**2 + length**2) / (2 * length)
+    square = first**2 - along**2
+    across = 1j * edge / length
+    side = np.where(_turn(edge, -places[0]) > 0, -1, 1)
+    return places[0] + edge / length * along + side * across * np.sqrt(np.maximum(square, 0)), square >= 0
+
+
+def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The cross product of complex numbers as vectors of the plane."""
+    return np.imag(np.conj(a) * b)
+
+
+def _is_between(point: np.ndarray, pair: np.ndarray, slack: float = 0.0) -> Bool[np.ndarray, " N"]:
+    """Whether zero sees a point between the two of a pair."""
+    sign = np.sign(_turn(pair[0], pair[1]))
+    least = -slack * np.abs(point) * np.abs(pair)
+    return (_turn(pair[0], point) * sign >= least[0]) & (_turn(point, pair[1]) * sign >= least[1])
+
+
+def _march(windows: _Windows, sources: np.ndarray, num_vertices: int) -> np.ndarray:
+    """The distances, those of nearer vertices first; what a shorter path lowers is looked at once more."""
+    distance, waits = np.full(num_vertices, np.inf), np.zeros(num_vertices, bool)
+    distance[sources], waits[sources] = 0, True
+    while waits.any():
+        waiting = np.flatnonzero(waits)
+        front = waiting[distance[waiting] <= distance[waiting].min() + windows.mean_length]
+        waits[front] = False
+        which = windows.of(front)
+        found = np.full(num_vertices, np.inf)
+        np.minimum.at(found, windows.targets[which], _arrivals(windows, which, distance))
+        is_nearer = found < distance * (1 - _ROUNDING)
+        distance[is_nearer] = found[is_nearer]
+        waits |= is_nearer
+    return distance
+
+
+def _arrivals(windows: _Windows, which: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """The distances of the targets of some windows by way of these."""
+    places, gap, known = windows.places[:, which], windows.gap[:, which], distance[windows.ends[:, which]]
+    is_known = np.isfinite(known)
+    reached = np.where(is_known, known, 0.0)
+    # As if from one point; and where its light does not fall through the gap, along an edge.
+    origin, exists = _apex(places, *reached)
+    is_lit = is_known.all(axis=0) & exists & _is_between(origin, places) & _is_between(origin, gap)
+    found = np.where(is_lit, np.abs(origin), np.inf)
+    for place, there, is_there in zip(places, reached, is_known, strict=True):
+        is_seen = is_there & _is_between(place, gap, _ROUNDING)
+        found = np.where(is_seen, np.minimum(found, there + np.abs(place)), found)
+    return found
+
+
+def _on_the_polyhedron(surface: Surface, sources: np.ndarray) -> np.ndarray:
+    """The distances along the triangles of the mesh itself."""
+    try:
+        import igl
+    except ImportError as error:
+        raise ImportError('The method "exact" needs libigl: pip install libigl, or ltljax[bench].') from error
+    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+    components = np.asarray(surface.topology.components)
+    distance = np.full(surface.num_vertices, np.inf)
+    for component in np.unique(components[sources]):
+        targets = np.flatnonzero(components == component)
+        own = sources[components[sources] == component]
+        distance[targets] = np.ravel(igl.exact_geodesic(vertices, faces, VS=own, VT=targets))
+    return distance

@@ -18,11 +18,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..equations import Equation
 from ..equations import boundary as bounds
 from ..lifting.schemes import Monotone, Paper, Polynomial
-from ..operators import growth_rate, spectral_bound
+from ..mesh.arguments import as_numbers
+from ..operators import growth_rate, spectral_bound, spectral_width
 from ..surface import Surface
 from ..tables import AnyArray
 from . import checks, taped
-from .implicit import SBDF2, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
+from .implicit import SBDF2, SHARE, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
+from .krylov import rms
 from .multigrid import Multigrid, is_available, multigrid
 from .restart import Keeper, fingerprint, in_intervals
 from .stabilised import RKL2, Stabilised, differentiable
@@ -31,7 +33,11 @@ from .steps import Advancing, TextMeter, without_twins
 # Eigenvalues with a real part below this share of the largest magnitude count as rounding.
 _GROWTH = 1e-8
 
-# With a scheme that has growing modes a state that is this many times its start (or one) is on its way to overflow.
+# A state overflows beyond this share of the largest number.
+_ALMOST_ALL = 1e-6
+
+# With a scheme that has growing modes a state that is this many times its start, or what the first rate would make of
+# it, is on its way to overflow.
 _GROWN = 1e6
 
 # Linear runs are quicker with implicit steps where they are this many times as long as the fastest decay, over the cube
@@ -79,7 +85,7 @@ class Steady(eqx.Module):
     def __call__(self, t, u, rate) -> Bool[Array, ""]:
         """Whether the state is steady."""
         del t
-        return jnp.linalg.norm(rate) <= self.tolerance * jnp.maximum(jnp.linalg.norm(u), 1e-30)
+        return rms(rate) <= self.tolerance * rms(u)
 
 
 class Solution(eqx.Module):
@@ -87,13 +93,14 @@ class Solution(eqx.Module):
 
     Attributes:
         ts: (T,) the times asked for; infinite where the run stopped before them.
-        us: (T, V) or (T, V, S) the states at these times.
+        us: (T, V) or (T, V, S) the states at these times; NaN where the run stopped before them.
         t_end: the time reached.
-        u_end: the state there.
+        u_end: the state there, also of a run that ``stop_when`` ended.
         counts: numbers of steps and, with `RKL2` and `RKL1`, of evaluations of the rate.
         result: `diffrax.RESULTS`; an overflow is not a failure of the solver and shows in ``overflowed`` instead.
-        overflowed: whether the state became NaN, larger than the root of the largest number (with other schemes than
-            `Monotone`, a million times its start), or so fast that time no longer resolved its changes.
+        overflowed: whether the state became NaN, larger than a millionth of the largest number (with other schemes than
+            `Monotone`, a million times its start), or so fast that time no longer resolved its changes; or whether a
+            fixed step came out as nonsense.
         stopped: whether ``stop_when`` held.
         interpolation: of a dense solution, from which `at` reads.
         method: the solver, and why it was taken.
@@ -169,7 +176,7 @@ def solve(
     t0: ArrayLike = 0.0,
     dt: float | None = None,
     rtol: float = 1e-4,
-    atol: float = 1e-6,
+    atol: float | None = None,
     max_steps: int | None = 1_000_000,
     stop_when: Condition | None = None,
     dense: bool = False,
@@ -203,16 +210,19 @@ def solve(
         solver: a solver.
         adjoint: how derivatives go through time; by default in reverse mode, for `RKL2` and `RKL1` at the cost of three
             to five runs, more with steps of more than 36 stages. Of n fixed steps some ``12 sqrt(n)`` states are then
-            kept, of adaptive ones 512, whose lengths count as given; of large states what a gigabyte holds (all of it
-            for each run of a batch). For other solvers, for dense solutions, with ``progress``, for times that are
-            traced, and where a gigabyte is too little, it is diffrax's recursive checkpointing: fixed steps are all
-            kept while that takes less than a gigabyte, otherwise the memory is that of ``sqrt(2 max_steps)`` states and
-            their rates, or of a gigabyte, and the cost 5 to 10 runs. `diffrax.ForwardMode()` for few parameters.
+            kept, of adaptive ones 512; of large states what a gigabyte holds (all of it for each run of a batch). The
+            lengths of adaptive steps count as given: the derivative is right to the error of the steps, and Taylor's
+            test (`check_gradient`) shows slope 1, with ``dt`` slope 2. For other solvers, for dense solutions, with
+            ``progress``, for times that are traced, and where a gigabyte is too little, it is diffrax's recursive
+            checkpointing: fixed steps are all kept while that takes less than a gigabyte, otherwise the memory is that
+            of ``sqrt(2 max_steps)`` states and their rates, or of a gigabyte, and the cost 5 to 10 runs.
+            `diffrax.ForwardMode()` for few parameters.
         progress: True for a progress bar, or a diffrax progress meter.
         t0: the first time.
         dt: the length of steps, for fixed ones; the last before each of ``ts`` may be shorter.
         rtol: relative tolerance of a step; implicit stages are solved to a hundredth of it.
-        atol: absolute tolerance of a step.
+        atol: absolute tolerance of a step; by default a hundredth of ``rtol`` times the largest that each species has
+            been in the run so far, so that a change of its unit changes nothing else.
         max_steps: steps after which the run counts as failed; None for no limit, which reverse-mode derivatives refuse.
         stop_when: ``(t, u, rate) -> bool``; the run ends with the first step after which it holds: `Steady`, or your
             own.
@@ -244,9 +254,13 @@ def solve(
         GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
             once for each surface, and not inside jit.
     """
-    u0 = jnp.asarray(u0, surface.dtype)
-    checks.state(surface, u0)
+    u0 = checks.field(surface, u0, "u0")
+    if checkpoint_dir is None and (resume or checkpoint_every is not None):
+        given = "resume=True" if resume else f"checkpoint_every={checkpoint_every}"
+        raise ValueError(f"{given} needs the folder that the run is kept in: give checkpoint_dir.")
     # In NumPy where they are known, which inside jit they would not be as JAX's arrays.
+    for time_name, time in (("t0", t0), ("t1", t1), ("ts", ts), ("dt", dt)):
+        as_numbers(time_name, time)
     times = [t1] if ts is None else ts
     is_known = not any(isinstance(time, Tracer) for time in jax.tree.leaves(times))
     times = (np if is_known else jnp).asarray(times, surface.dtype)
@@ -259,8 +273,13 @@ def solve(
         raise TypeError(
             f"Expected as preconditioner what ltl.multigrid(surface) returned, found {type(preconditioner).__name__}."
         )
+    if not surface.is_traced:
+        surface = eqx.tree_at(
+            lambda s: s.geometry.spectral_width, surface, spectral_width(surface), is_leaf=lambda leaf: leaf is None
+        )
     # As arrays, so that other tolerances need no compiling.
-    relative, absolute = (jnp.asarray(tolerance, surface.dtype) for tolerance in (rtol, atol))
+    relative = jnp.asarray(rtol, surface.dtype)
+    absolute = None if atol is None else jnp.asarray(atol, surface.dtype)
     if solver is None:
         method, why = _choice(equation, surface, u0, t0, t1, rtol, dense)
     else:
@@ -436,7 +455,7 @@ def _meter(progress: bool | diffrax.AbstractProgressMeter) -> diffrax.AbstractPr
 @eqx.filter_jit
 def _fixed(equation, surface, u0, grid, ts, solver, stop_when, marks, finer) -> Solution:
     """Fixed steps of a stabilised solver."""
-    start, rules = _start_and_rules(equation, surface, grid[0], u0, solver, stop_when)
+    start, rules = _start_and_rules(equation, surface, grid[0], grid[-1] - grid[0], u0, solver, stop_when)
     found = taped.march(start, rules, grid, marks, finer)
     zero = jnp.zeros_like(found.num_steps)
     counts = dict(num_steps=found.num_steps, num_accepted_steps=found.num_steps, num_rejected_steps=zero)
@@ -452,17 +471,23 @@ def _fixed(equation, surface, u0, grid, ts, solver, stop_when, marks, finer) -> 
 @eqx.filter_jit
 def _adaptive(equation, surface, u0, t0, t1, ts, solver, adjoint, rtol, atol, max_steps, stop_when) -> Solution:
     """Adaptive steps of a stabilised solver."""
-    start, rules = _start_and_rules(equation, surface, t0, u0, solver, stop_when)
+    start, rules = _start_and_rules(equation, surface, t0, t1 - t0, u0, solver, stop_when)
+
+    size = equation.size
 
     def explore(how, start, rules, is_recorded):
         t0, t1, ts, rtol, atol = how
-        (u0, rate), (solver, bound, largest, condition) = start, rules
-        solver = dataclasses.replace(solver, spectral_bound=lambda t, u, _: bound(t, u))
+        (u0, rate), (solver, extent, largest, condition) = start, rules
+        solver = dataclasses.replace(
+            solver,
+            spectral_bound=lambda t, u, _: extent(t, u)[0],
+            spectral_width=lambda t, u, _: extent(t, u)[1],
+        )
         stop = None if condition is None else lambda t, u, _: condition(t, u, rate(t, u))
         out = _by_diffrax(
             lambda t, u, _: rate(t, u), None, solver, adjoint, diffrax.NoProgressMeter(), u0, t0, t1,
-            _first_step(bound(t0, u0), t0, t1), ts, _controller(rtol, atol), max_steps, largest, stop, False,
-            is_recorded,
+            _first_step(extent(t0, u0)[0], t0, t1), ts, _controller(rtol, atol, solver, size), max_steps, largest, stop,
+            False, is_recorded,
         )  # fmt: skip
         times = jnp.concatenate([t0[None], cast(Any, out.ts)[2]]) if is_recorded else None
         (us, u_end, *_), (ts, t_end, *_) = cast(Any, out.ys), cast(Any, out.ts)
@@ -473,7 +498,7 @@ def _adaptive(equation, surface, u0, t0, t1, ts, solver, adjoint, rtol, atol, ma
     return _as_held(equation, surface, ts, us, t_end, u_end, *outcome, None, "", False)
 
 
-def _start_and_rules(equation, surface, t0, u0, solver, stop_when) -> tuple[tuple[Array, Any], taped.Rules]:
+def _start_and_rules(equation, surface, t0, span, u0, solver, stop_when) -> tuple[tuple[Array, Any], taped.Rules]:
     """The state and the rate that a run begins with, and the rest, as functions of the time and the state."""
     u0 = equation.held(t0, surface, u0)
 
@@ -484,9 +509,9 @@ def _start_and_rules(equation, surface, t0, u0, solver, stop_when) -> tuple[tupl
     # As diffrax has it: broadcast to the state, and in its float type.
     term = diffrax.ODETerm(_rate)
     rate = closed(lambda t, u: term.vf(t, u, (equation, surface)), t0, u0)
-    bound = closed(lambda t, u: solver.spectral_bound(t, u, (equation, surface)), t0, u0)
+    extent = closed(lambda t, u: solver.extent(t, u, (equation, surface)), t0, u0)
     condition = None if stop_when is None else closed(_checked(stop_when), t0, u0, u0)
-    return (u0, rate), taped.Rules(*_constant((solver, bound, _largest(surface, u0), condition)))
+    return (u0, rate), taped.Rules(*_constant((solver, extent, _largest(surface, u0, rate(t0, u0) * span), condition)))
 
 
 def _checked(stop_when: Condition) -> Condition:
@@ -506,19 +531,20 @@ def _constant(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-def _largest(surface: Surface, u0: Array) -> Array:
-    """What no state may exceed."""
-    # Products of what is larger are no numbers.
-    largest = jnp.sqrt(jnp.finfo(u0.dtype).max)
+def _largest(surface: Surface, u0: Array, change: Array) -> Array:
+    """What no state may exceed, if it begins like this and would change so much at the first rate."""
+    # A rate that is larger by the stiffness would be no number.
+    largest = jnp.asarray(_ALMOST_ALL * jnp.finfo(u0.dtype).max, u0.dtype)
     if isinstance(surface.scheme, Monotone):
         return largest
     # Growing modes get there by ever shorter steps: what grew beyond this is on its way.
-    return jnp.minimum(largest, _GROWN * jnp.maximum(1, jnp.max(jnp.abs(u0))))
+    return jnp.minimum(largest, _GROWN * jnp.maximum(jnp.max(jnp.abs(u0)), jnp.max(jnp.abs(change))))
 
 
 def _as_held(equation: Equation, surface: Surface, ts: Array, us: Array, t_end: Array, u_end: Array, *rest) -> Solution:
     """The solution with the values that conditions hold: the integrated rate of such a value ends near it only."""
     us = jax.vmap(lambda t, u: equation.held(t, surface, u))(ts, us)
+    us = jnp.where(jnp.isfinite(ts).reshape(-1, *(1,) * u_end.ndim), us, jnp.nan)
     return Solution(ts, us, t_end, equation.held(t_end, surface, u_end), *rest)
 
 
@@ -527,7 +553,7 @@ def _solve(
     equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense
 ) -> Solution:
     u0 = equation.held(t0, surface, u0)
-    largest = _largest(surface, u0)
+    largest = _largest(surface, u0, equation.rate(t0, surface, u0) * (t1 - t0))
 
     def stop(t, u, args):
         equation, surface = args
@@ -537,8 +563,10 @@ def _solve(
         controller, dt0 = diffrax.StepTo(ts=grid), None
         # Of a known number of steps the checkpoints are few.
         max_steps = min(len(grid) - 1, max_steps) if max_steps is not None else len(grid) - 1
+    elif not isinstance(solver, diffrax.AbstractAdaptiveSolver):  # in a run of no length, which has no steps
+        controller, dt0 = diffrax.ConstantStepSize(), jnp.ones_like(t1)
     else:
-        controller = _controller(rtol, atol)
+        controller = _controller(rtol, atol, solver, equation.size)
         dt0 = _first_step(equation.spectral_bound(t0, surface, u0), t0, t1)
         if isinstance(solver, ImplicitRungeKutta):  # whose interpolation is linear
             controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
@@ -552,9 +580,13 @@ def _solve(
     )
 
 
-def _controller(rtol: Array, atol: Array) -> Any:
-    # The type checker does not see that the arguments left out have defaults.
-    return Advancing(diffrax.PIDController(rtol=rtol, atol=atol))  # type: ignore
+def _controller(rtol: Array, atol: Array | None, solver: diffrax.AbstractSolver, size: Callable[[Array], Array]) -> Any:
+    longest = None
+    if isinstance(solver, Stabilised):
+        longest = lambda t, u, args: solver.longest_step(solver.extent(t, u, args))  # noqa: E731
+    # The type checker does not see that the arguments left out have defaults, nor the order of fields.
+    inner = diffrax.PIDController(rtol=rtol, atol=jnp.zeros_like(rtol) if atol is None else atol)  # type: ignore
+    return Advancing(inner, longest, None if atol is not None else SHARE * rtol, size)  # type: ignore
 
 
 def _first_step(bound: Array, t0: Array, t1: Array) -> Array:

@@ -21,13 +21,15 @@ from jaxtyping import Array, Float
 from ..equations import Equation
 from ..operators import diagonal
 from ..surface import Surface
-from .krylov import BiCGStab, Preconditioner, linear_solve
+from .krylov import BiCGStab, Preconditioner, linear_solve, rms, unit_of
 from .multigrid import Multigrid
 
 # Linear systems are solved to this share of the tolerance of a step, Newton's iterations to the share optimistix takes.
 _SHARE = 1e-2
 # And at least to this relative residual, which also bounds the error of derivatives.
 _LOOSEST = 1e-4
+# Absolute tolerances that are not given are this share of the relative one, times the size of a species.
+SHARE = 1e-2
 _MAX_NEWTON = 10
 
 
@@ -60,12 +62,12 @@ class Preconditioning(eqx.Module):
     Attributes:
         multigrid: the hierarchy of the surface; None for Jacobi's method.
         rtol: relative tolerance of a step.
-        atol: absolute tolerance of a step.
+        atol: absolute tolerance of a step; None for a hundredth of ``rtol`` times the size of each species.
     """
 
     multigrid: Multigrid | None = None
     rtol: Array | float = 1e-4
-    atol: Array | float = 1e-6
+    atol: Array | float | None = None
 
     def of(self, surface: Surface, alpha: Array, beta: Array) -> Preconditioner:
         """An approximate inverse of ``alpha - beta Delta``, with one alpha and one beta for every species."""
@@ -73,11 +75,15 @@ class Preconditioning(eqx.Module):
             return Cycle(self.multigrid, alpha, beta)
         return Jacobi(1 / (alpha[None] - beta[None] * diagonal(surface)[:, None]))
 
-    def tolerance(self, u: Array, b: Array) -> Array:
+    def absolute(self, unit: Array) -> Array:
+        """The absolute tolerance of each species, in units of their own."""
+        return jnp.broadcast_to(SHARE * self.rtol if self.atol is None else self.atol / unit, unit.shape)
+
+    def tolerance(self, u: Array, b: Array, absolute: Array) -> Array:
         """Of a linear system for a state like u with right side b, relative to b."""
-        wanted = _SHARE * (self.atol * jnp.sqrt(u.size) + self.rtol * jnp.linalg.norm(u))
-        least = 20 * jnp.finfo(u.dtype).eps
-        return jax.lax.stop_gradient(jnp.clip(wanted / jnp.maximum(jnp.linalg.norm(b), 1e-30), least, _LOOSEST))
+        wanted = _SHARE * (jnp.sqrt(jnp.mean(absolute**2)) + self.rtol * rms(u))
+        least, size = 20 * jnp.finfo(u.dtype).eps, rms(b)
+        return jax.lax.stop_gradient(jnp.clip(wanted / jnp.where(size > 0, size, 1), least, _LOOSEST))
 
 
 class Cycle(Preconditioner):
@@ -118,6 +124,19 @@ def implicit_stage(
 
     One linear system where the rate is affine, else Newton's method; differentiable by the implicit function theorem.
     """
+    # In units in which every species is of size one, or as large as the others where it vanishes.
+    size = jnp.maximum(equation.size(right), equation.size(guess))
+    unit = unit_of(jnp.where(size > 0, size, jnp.max(size)))[None]
+    y, found = _stage_in_units(
+        equation, lambda y: rate(y * unit) / unit, is_affine, surface, factor, right / unit, guess / unit,
+        preconditioning, preconditioning.absolute(unit), scale,
+    )  # fmt: skip
+    return y * unit, found
+
+
+def _stage_in_units(
+    equation, rate, is_affine, surface, factor, right, guess, preconditioning, absolute, scale
+) -> tuple[Array, Array]:
     diffusivity = jnp.broadcast_to(equation.diffusivities(right), (right[0].size,)).astype(right.dtype)
     alpha, beta = jnp.broadcast_to(jnp.asarray(scale, right.dtype), diffusivity.shape), factor * diffusivity
     preconditioner = jax.lax.stop_gradient(preconditioning.of(surface, alpha, beta))
@@ -125,7 +144,7 @@ def implicit_stage(
     if is_affine:
         value, derivative = jax.linearize(rate, guess)
         defect = right - scale * guess + factor * value
-        tolerance = preconditioning.tolerance(guess, defect)
+        tolerance = preconditioning.tolerance(guess, defect, absolute)
         found = linear_solve(lambda d: scale * d - factor * derivative(d), defect, preconditioner, tolerance)
         return guess + found.value, found.result == lx.RESULTS.successful
 
@@ -136,12 +155,12 @@ def implicit_stage(
     # Closed over, what the rate depends on would be invisible to the derivative of the root.
     rate = eqx.filter_closure_convert(rate, guess)
     # Corrections below what the tolerance can see are none, or the last would be solved for among rounding errors.
-    enough = 1e-3 * (preconditioning.atol + preconditioning.rtol * jnp.sqrt(jnp.mean(guess**2)))
+    enough = 1e-3 * (jnp.sqrt(jnp.mean(absolute**2)) + preconditioning.rtol * rms(guess))
     enough = jax.lax.stop_gradient(jnp.asarray(enough, right.dtype))
     solver = BiCGStab(jnp.asarray(_LOOSEST, right.dtype), preconditioner, absolute=enough)
     newton = _Newton(
         jnp.asarray(preconditioning.rtol, right.dtype),
-        jnp.asarray(preconditioning.atol, right.dtype),
+        jax.lax.stop_gradient(jnp.asarray(absolute, right.dtype)),
         norm=optx.rms_norm,
         linear_solver=solver,
         cauchy_termination=False,
@@ -393,6 +412,11 @@ def without_matrices(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
             raise ValueError(
                 f"{type(solver).__name__} solves its stages with a matrix of the size of the state. Expected one of "
                 f"{names}, or ltl.TRBDF2, ltl.CrankNicolson, ltl.SBDF2."
+            )
+        if not eqx.tree_equal(solver, type(solver)()):
+            raise ValueError(
+                f"{type(solver).__name__} was given settings of its own, such as a root_finder, which would have no "
+                "effect: its stages are solved by Krylov iteration. Leave them out; rtol of ltl.solve says how well."
             )
         return ImplicitRungeKutta(_OF_DIFFRAX[type(solver)])
     return solver

@@ -15,6 +15,19 @@ import lineax as lx
 from jaxtyping import Array
 
 
+def unit_of(x: Array) -> Array:
+    """The power of two above a magnitude (any shape), and one in place of zero: to divide by without rounding, so that
+    squares stay within the range of the float type."""
+    exponent = jnp.frexp(jax.lax.stop_gradient(jnp.abs(x)))[1]
+    return jnp.where((x == 0) | ~jnp.isfinite(x), 1, jnp.ldexp(jnp.ones_like(x), exponent))
+
+
+def rms(x: Array) -> Array:
+    """The root mean square, whatever the unit of x."""
+    unit = unit_of(jnp.max(jnp.abs(x)))
+    return unit * jnp.sqrt(jnp.mean((x / unit) ** 2))
+
+
 class Preconditioner(eqx.Module):
     """An approximate inverse, and that of the transposed operator."""
 
@@ -62,8 +75,10 @@ class BiCGStab(lx.AbstractLinearSolver):
         """The solution, whether it was found, and the number of iterations."""
         del options
         operator, transposed = state
+        unit = unit_of(jnp.max(jnp.abs(vector)))
+        vector = vector / unit
         size = jnp.sqrt(jnp.sum(vector**2))
-        enough = jnp.asarray(self.absolute, vector.dtype) * vector.size**0.5
+        enough = jnp.asarray(self.absolute, vector.dtype) / unit * vector.size**0.5
         goal = jnp.maximum(jnp.asarray(self.tolerance, vector.dtype) * size, enough)
         tiny = jnp.finfo(vector.dtype).tiny
         shadow = vector
@@ -95,7 +110,7 @@ class BiCGStab(lx.AbstractLinearSolver):
         (x, r, *_), passes = jax.lax.while_loop(goes_on, half, (start, jnp.zeros((), jnp.int32)))
         found = jnp.sqrt(jnp.sum(r**2)) <= goal
         result = lx.RESULTS.where(found, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
-        return x, result, {"num_steps": (passes + 1) // 2, "max_steps": self.max_steps}
+        return x * unit, result, {"num_steps": (passes + 1) // 2, "max_steps": self.max_steps}
 
     def transpose(self, state, options):
         """The transposed operator, for which the preconditioner is transposed too."""
@@ -128,7 +143,7 @@ class GMRES(lx.AbstractLinearSolver):
 
     def _inner(self, dtype) -> lx.GMRES:
         tolerance: Any = jnp.asarray(self.tolerance, dtype)
-        return lx.GMRES(0.0, tolerance, _rms, self.max_steps, self.restart, self.max_steps)
+        return lx.GMRES(0.0, tolerance, rms, self.max_steps, self.restart, self.max_steps)
 
     def init(self, operator, options):
         """The operator, which is not looked into."""
@@ -139,7 +154,7 @@ class GMRES(lx.AbstractLinearSolver):
         """The solution, whether it was found, and the number of iterations."""
         del options
         operator, transposed = state
-        size = jnp.maximum(_rms(vector), jnp.finfo(vector.dtype).tiny)
+        size = jnp.maximum(rms(vector), jnp.finfo(vector.dtype).tiny)
         inverse = lx.FunctionLinearOperator(lambda r: self.preconditioner(r, transposed), operator.in_structure())
         inner = self._inner(vector.dtype)
         x, result, stats = inner.compute(inner.init(operator, {}), vector / size, {"preconditioner": inverse})
@@ -198,10 +213,6 @@ class Persistent(lx.AbstractLinearSolver):
     def assume_full_rank(self):
         """Singular systems are made regular before they come here."""
         return True
-
-
-def _rms(x: Array) -> Array:
-    return jnp.sqrt(jnp.mean(x**2))
 
 
 def linear_solve(

@@ -306,7 +306,7 @@ def in_intervals(
             break
     assert solution is not None  # the last interval is always advanced
     reached = (np.abs(ends[places] - asked) <= slack) & (ends[places] <= last["t"])
-    never = np.full(u0.shape, np.inf, u0.dtype)
+    never = np.full(u0.shape, np.nan, u0.dtype)
     us = [kept[place] if has else never for place, has in zip(places.tolist(), reached, strict=True)]
     return dataclasses.replace(
         solution,

@@ -20,11 +20,25 @@ STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
 
 FEWEST = int(STAGES[0])
 
+# How far the stages are damped: stage polynomials are taken about the point cosh(angle), and at the angle zero they are
+# those of the papers. Fewer stages than these angles over the last one gain nothing from more damping.
+_ANGLES = np.append(0, np.geomspace(1.5 / STAGES[-1], 2.5, 17))
+
+
+# A step is nonsense if after it the rate would change the state by so many times its size.
+_NONSENSE = 10
+
 
 def bound_of_equation(t, u, args):
     """The spectral bound of the equation that is solved."""
     equation, surface = args
     return equation.spectral_bound(t, surface, u)
+
+
+def width_of_equation(t, u, args):
+    """The spectral width of the equation that is solved."""
+    equation, surface = args
+    return equation.spectral_width(t, surface, u)
 
 
 class Plan(NamedTuple):
@@ -70,10 +84,41 @@ class Plan(NamedTuple):
         return cast(Any, tuple(jnp.where(is_there, x, rest) for x, rest in zip(row, (1, 0, 0, 0), strict=True)))
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Family:
+    """Stages on offer, M in all: of each number of them several, from no damping to much.
+
+    Those of a step of length dt are stable where eigenvalues x + iy, of negative real part, satisfy
+    ``dt y^2 <= parabola |x| (1 - dt |x| / reach)``.
+
+    Attributes:
+        stages: (M,) their number, ascending.
+        level: (M,) how much they are damped, as a row of ``rows``.
+        scale: (M,) what multiplies the rates.
+        reach: (M,) how far along the negative real axis they are stable.
+        parabola: (M,) how wide they are stable close to the origin.
+        rows: (5, N, 257 + 1) the coefficients of stage j, those of rates over ``scale``: mu, nu, mu_rate, gamma_rate
+            and c as of `Plan`.
+    """
+
+    stages: np.ndarray
+    level: np.ndarray
+    scale: np.ndarray
+    reach: np.ndarray
+    parabola: np.ndarray
+    rows: np.ndarray
+
+    def inverse_lengths(self, extent: Float[Array, "2"]) -> Float[Array, " M"]:
+        """One over the longest stable step of each, where eigenvalues have such a bound and width."""
+        bound, width = extent
+        return bound / jnp.asarray(self.reach, bound.dtype) + width / jnp.asarray(self.parabola, bound.dtype)
+
+
 class Stabilised(diffrax.AbstractAdaptiveSolver):
     """What the steppers share: a recurrence over as many stages as the length of a step needs."""
 
     spectral_bound: eqx.AbstractVar[Callable[..., Float[Array, ""]]]
+    spectral_width: eqx.AbstractVar[Callable[..., Float[Array, ""]]]
     loop_kind: eqx.AbstractVar[Literal["lax", "checkpointed", "bounded"]]
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -81,8 +126,8 @@ class Stabilised(diffrax.AbstractAdaptiveSolver):
 
     @staticmethod
     @abc.abstractmethod
-    def _coefficients() -> dict[str, np.ndarray]:
-        """One row for each number of stages on offer; entry j belongs to stage j."""
+    def _family() -> "Family":
+        """The stages on offer."""
 
     @abc.abstractmethod
     def _error(self, increment, dt, rate0, rate1) -> Array:
@@ -96,7 +141,7 @@ class Stabilised(diffrax.AbstractAdaptiveSolver):
         """One step with as many stages as its length needs."""
         del made_jump
         rate0, evaluations = solver_state
-        plan = self.plan(self.spectral_bound(t0, y0, args), t1 - t0)
+        plan = self.plan(self.extent(t0, y0, args), t1 - t0)
 
         def stage(carry):
             j, before, last = carry
@@ -110,32 +155,52 @@ class Stabilised(diffrax.AbstractAdaptiveSolver):
         y1 = y0 + increment
         rate1 = terms.vf(t1, y1, args)
         error = self._error(increment, plan.dt, rate0, rate1)
-        y1, error = jnp.where(plan.is_stable, y1, jnp.nan), jnp.where(plan.is_stable, error, jnp.inf)
+        is_good = plan.is_stable & is_sensible(plan.dt, y0, increment, rate0, rate1)
+        y1, error = jnp.where(is_good, y1, jnp.nan), jnp.where(is_good, error, jnp.inf)
         dense = dict(y0=y0, y1=y1, k0=plan.dt * rate0, k1=plan.dt * rate1)
         state = (rate1, evaluations + plan.stages.astype(evaluations.dtype))
         return y1, error, dense, state, diffrax.RESULTS.successful
 
-    def plan(self, bound: Float[Array, ""], length: ArrayLike) -> Plan:
-        """The stages of a step of some length where eigenvalues are within a bound."""
-        length = jnp.asarray(length)
-        table = {name: jnp.asarray(values, length.dtype) for name, values in self._coefficients().items()}
-        reach = table["reach"]
+    def extent(self, t, y, args) -> Float[Array, "2"]:
+        """How far the eigenvalues of the rate's derivative extend: their bound and their width."""
+        bound = jnp.asarray(self.spectral_bound(t, y, args))
+        return jnp.stack([bound, jnp.asarray(self.spectral_width(t, y, args), bound.dtype)])
+
+    def plan(self, extent: Float[Array, "2"], length: ArrayLike) -> Plan:
+        """The stages of a step of some length where eigenvalues extend so far."""
+        length, family = jnp.asarray(length), self._family()
+        inverse = family.inverse_lengths(extent)
         # Beyond the largest number of stages a step would be unstable: an adaptive controller refuses it, and without
         # one the run stops at what is not a number. Its stages are those of the longest stable step: if they
         # overflowed, so would derivatives, whatever is made of their values.
-        is_stable = length * bound <= reach[-1]
-        dt = jnp.where(is_stable, length, jax.lax.stop_gradient(reach[-1] / jnp.maximum(bound, 1e-30)))
-        choice = jnp.minimum(jnp.searchsorted(reach, dt * bound), len(STAGES) - 1)
-        rows = {name: table[name][choice] for name in ("mu", "nu", "mu_rate", "gamma_rate", "c")}
-        return Plan(jnp.asarray(STAGES)[choice], dt, is_stable, **rows)
+        is_enough = length * inverse <= 1
+        is_stable, longest = jnp.any(is_enough), jnp.argmin(inverse)
+        dt = jnp.where(is_stable, length, jax.lax.stop_gradient(1 / jnp.maximum(inverse[longest], 1e-30)))
+        # Members are in the order of their stages, and of their damping.
+        choice = jnp.where(is_stable, jnp.argmax(is_enough), longest)
+        stages, level = jnp.asarray(family.stages)[choice], jnp.asarray(family.level)[choice]
+        scale = jnp.asarray(family.scale, length.dtype)[choice]
+        mu, nu, mu_rate, gamma_rate, c = jnp.asarray(family.rows, length.dtype)[:, level]
+        return Plan(stages, dt, is_stable, mu, nu, scale * mu_rate, scale * gamma_rate, scale * c)
 
-    def longest_step(self, bound: float) -> float:
-        """The longest stable step where eigenvalues are within a bound."""
-        return float(self._coefficients()["reach"][-1]) / max(bound, 1e-30)
+    def longest_step(self, extent: Float[Array, "2"]) -> Float[Array, ""]:
+        """The longest stable step where eigenvalues extend so far."""
+        return 1 / jnp.maximum(jnp.min(self._family().inverse_lengths(extent)), 1e-30)
 
     def func(self, terms, t0, y0, args) -> Any:
         """The rate of change."""
         return terms.vf(t0, y0, args)
+
+
+def is_sensible(dt: Array, y0: Array, increment: Array, rate0: Array, rate1: Array) -> Bool[Array, ""]:
+    """Whether a step is no nonsense, as one is that changes the state by half of it and more, and after which the rate
+    would change it by ten times as much again, though it would not have before.
+
+    So it is in every species, by its largest values. What is unstable grows where it is seen in a rate first.
+    """
+    start, change, first, last = (jnp.max(jnp.abs(x), axis=0) for x in (y0, increment, rate0, rate1))
+    grows = (last > first) & (dt * last > _NONSENSE * (start + change))
+    return ~jnp.any((start > 0) & (change > start / 2) & grows)
 
 
 def differentiable(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
@@ -158,6 +223,7 @@ class RKL2(Stabilised):
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
+        spectral_width: ``(t, y, args) -> width``; by default that of the equation.
         loop_kind: of the loop over stages, as equinox names them: ``"checkpointed"`` for derivatives in reverse mode,
             ``"lax"`` for forward mode; `solve` chooses it by its adjoint.
 
@@ -166,6 +232,7 @@ class RKL2(Stabilised):
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
+    spectral_width: Callable[..., Float[Array, ""]] = width_of_equation
     loop_kind: Literal["lax", "checkpointed", "bounded"] = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
@@ -174,12 +241,11 @@ class RKL2(Stabilised):
 
     @staticmethod
     @functools.cache
-    def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        s, j = STAGES[:, None], _stage_numbers()
-        b = np.where(j < 2, 1 / 3, (j**2 + j - 2) / (2 * j * (j + 1)))
-        c = (j**2 + j - 2) / (s**2 + s - 2)
-        c[:, 1] = c[:, 2] / 3
-        return _legendre(b, 4 / (s**2 + s - 2), c)
+    def _family():  # type: ignore
+        value, slope, bend = _legendre(np.cosh(_ANGLES))
+        b = bend[:, 2:] / slope[:, 2:] / slope[:, 2:]
+        b = np.concatenate([b[:, :1], b[:, :1], b], axis=1)
+        return _family_of(b, value, slope, slope[:, STAGES] / bend[:, STAGES], narrowest=0.9)
 
     def _error(self, increment, dt, rate0, rate1):
         # The third derivative's share in the error is 1/18, that in the trapezoidal rule's 1/12.
@@ -193,6 +259,7 @@ class RKL1(Stabilised):
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
+        spectral_width: ``(t, y, args) -> width``; by default that of the equation.
         loop_kind: of the loop over stages, as equinox names them: ``"checkpointed"`` for derivatives in reverse mode,
             ``"lax"`` for forward mode; `solve` chooses it by its adjoint.
 
@@ -200,6 +267,7 @@ class RKL1(Stabilised):
     """
 
     spectral_bound: Callable[..., Float[Array, ""]] = bound_of_equation
+    spectral_width: Callable[..., Float[Array, ""]] = width_of_equation
     loop_kind: Literal["lax", "checkpointed", "bounded"] = eqx.field(default="checkpointed", static=True)
 
     def order(self, terms):
@@ -212,26 +280,46 @@ class RKL1(Stabilised):
 
     @staticmethod
     @functools.cache
-    def _coefficients() -> dict[str, np.ndarray]:  # type: ignore
-        s, j = STAGES[:, None], _stage_numbers()
-        return _legendre(np.ones(j.shape), 2 / (s**2 + s), (j**2 + j) / (s**2 + s))
+    def _family():  # type: ignore
+        value, slope, _ = _legendre(np.cosh(_ANGLES))
+        return _family_of(1 / value, value, slope, value[:, STAGES] / slope[:, STAGES], narrowest=2.3)
 
     def _error(self, increment, dt, rate0, rate1):
         return 0.5 * dt * (rate0 + rate1) - increment
 
 
-def _stage_numbers() -> np.ndarray:
-    # Entry 0 is of no stage; the one in its place keeps the formulas finite.
-    return np.maximum(np.arange(STAGES[-1] + 1), 1).astype(float)
+def _legendre(w0: np.ndarray) -> np.ndarray:
+    """Legendre's polynomials and their first and second derivatives at some points (N,): (3, N, 257 + 1)."""
+    found = np.zeros((3, len(w0), STAGES[-1] + 1))
+    value, slope, bend = found
+    value[:, 0], value[:, 1], slope[:, 1] = 1, w0, 1
+    for j in range(2, STAGES[-1] + 1):
+        for row, extra in ((value, 0), (slope, value[:, j - 1]), (bend, 2 * slope[:, j - 1])):
+            row[:, j] = ((2 * j - 1) * (w0 * row[:, j - 1] + extra) - (j - 1) * row[:, j - 2]) / j
+    return found
 
 
-def _legendre(b: np.ndarray, scale: np.ndarray, c: np.ndarray) -> dict[str, np.ndarray]:
-    """The recurrence of Legendre polynomials, stage j being 1 - b[j] + b[j] P_j(1 + scale z) of z = dt lambda."""
-    j = _stage_numbers()
-    before, last = np.roll(b, 2), np.roll(b, 1)
-    mu, nu = (2 * j - 1) / j * b / last, (1 - j) / j * b / before
-    mu_rate = mu * scale
-    mu_rate[:, 1:2] = b[1] * scale
-    table = dict(mu=mu, nu=nu, mu_rate=mu_rate, gamma_rate=(last - 1) * mu_rate, c=c)
-    table = {name: np.broadcast_to(values, mu_rate.shape) for name, values in table.items()}
-    return table | dict(reach=2 / scale[:, 0])
+def _family_of(b: np.ndarray, value: np.ndarray, slope: np.ndarray, scale: np.ndarray, narrowest: float) -> Family:
+    """The family whose stage j is 1 - b[j] P_j(w0) + b[j] P_j(w0 + scale z) of z = dt lambda.
+
+    Args:
+        b: (N, 257 + 1) at each angle.
+        value: of Legendre's polynomials P at w0, the cosine of the angle; and ``slope`` of their derivatives.
+        scale: (N, 28) at each angle, of each number of stages.
+        narrowest: the parabola of stages without damping.
+    """
+    j, w0 = np.maximum(np.arange(STAGES[-1] + 1), 1.0), np.cosh(_ANGLES)[:, None]
+    before, last = np.roll(b, 2, axis=1), np.roll(b, 1, axis=1)
+    mu_rate, nu = (2 * j - 1) / j * b / last, (1 - j) / j * b / before
+    mu = w0 * mu_rate
+    mu_rate[:, 1] = b[:, 1]
+    gamma_rate = (np.roll(b * value, 1, axis=1) - 1) * mu_rate
+    rows = np.stack([mu, nu, mu_rate, gamma_rate, b * slope])
+    # The first stage has none before it, and there is no stage zero.
+    rows[[0, 1, 3], :, 1], rows[:, :, 0] = 0, 0
+    # On the ellipse with the foci -1 and 1 through w0 no |P_j| is larger than at w0, so that there no stage grows.
+    reach = 2 * w0 / scale
+    parabola = np.maximum(narrowest, (1 - 1 / w0**2) * reach)
+    level, number = (axis.T.ravel() for axis in np.indices(scale.shape))
+    of_member = level, number
+    return Family(STAGES[number], level, scale[of_member], reach[of_member], parabola[of_member], rows)

@@ -27,7 +27,7 @@ from . import checks
 from .direct import Factorized, factor
 from .evolve import SolveError, Steady, hierarchy, solve, what_is_fixed
 from .implicit import Preconditioning
-from .krylov import GMRES, linear_solve
+from .krylov import GMRES, linear_solve, rms, unit_of
 from .multigrid import Multigrid
 
 # A right side whose mean is more than this share of its size was not meant to have none; nor one that has more than
@@ -44,6 +44,8 @@ _GROWN = 1e6
 _FACTORISED = {Monotone: 50_000, Polynomial: 20_000, Paper: 0}
 # Of the steps in time towards a stationary state, in units of the reaction's time.
 _LONGEST = 1e4
+# And of the stiffness, where there is hardly a reaction.
+_SLOWEST = 1e-10
 
 
 class IncompatibleSourceWarning(UserWarning):
@@ -110,8 +112,7 @@ def screened_poisson(
 
 
 def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw):
-    f = jnp.asarray(f, surface.dtype)
-    checks.state(surface, f)
+    f = checks.field(surface, f, "the right side")
     if not isinstance(f, Tracer) and not np.isfinite(np.asarray(f)).all():
         raise ValueError(f"The right side is not finite at vertex {np.argwhere(~np.isfinite(np.asarray(f)))[0][0]}.")
     if jnp.shape(screening) not in ((), f.shape[:1]):
@@ -231,7 +232,8 @@ def _stationary(
     # With what rounding and an unfinished iteration leave of a mean that is none.
     rounding = (1e3 * jnp.finfo(start.dtype).eps + tolerance) / _INCOMPATIBLE
     number = _over_components(surface, jnp.ones_like(surface.vertex_areas)).reshape(-1, *trailing)
-    size = jnp.sqrt(_over_components(surface, load**2) / number) + rounding * jnp.sqrt(jnp.mean(value**2))
+    unit = unit_of(jnp.max(jnp.abs(load)))
+    size = unit * jnp.sqrt(_over_components(surface, (load / unit) ** 2) / number) + rounding * rms(value)
     return (
         u,
         constants * scale * diffusivities[None],
@@ -287,8 +289,7 @@ def steady_state(
     Source: Kelley and Keyes (1998), Convergence analysis of pseudo-transient continuation,
     doi:10.1137/S0036142996304796.
     """
-    u0 = jnp.asarray(u0, surface.dtype)
-    checks.state(surface, u0)
+    u0 = checks.field(surface, u0, "u0")
     checks.finite(equation, u0)
     if isinstance(preconditioner, Factorized) and not isinstance(equation, Diffusion):
         raise ValueError(
@@ -364,27 +365,27 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
     stiffness = equation.spectral_bound(time, surface, u0)
     reaction = jnp.maximum(stiffness - jnp.max(flat) * spectral_bound(surface), 0)
 
-    def rms(u):
-        return jnp.sqrt(jnp.mean(u**2))
-
     is_held = bounds.held_vertices(surface, equation.conditions).reshape(-1, *(1,) * (u0.ndim - 1))
 
     def rate(u):
         # What is held returns to its value, which makes the system regular and lets derivatives see the data.
         return jnp.where(is_held, equation.held(time, surface, u) - u, equation.rate(time, surface, u))
 
-    dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, 1e-6))
+    dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, _SLOWEST * stiffness))
 
     def inverse(shift):
         alpha = jnp.broadcast_to(shift + reaction / 4, flat.shape)
         return jax.lax.stop_gradient(preconditioning.of(surface, alpha, flat))
+
+    # Of a start at zero, what the rate there makes of it.
+    least = jax.lax.stop_gradient(jnp.maximum(rms(rate(u0)) * dt0, jnp.finfo(u0.dtype).tiny))
 
     def march(carry):
         u, value, dt, steps = carry
         _, derivative = jax.linearize(rate, u)
         operator = lx.FunctionLinearOperator(lambda d: d / dt - derivative(d), jax.eval_shape(lambda: u))
         found = lx.linear_solve(operator, value, GMRES(1e-3, inverse(1 / dt)), throw=False)
-        change = rms(found.value) / jnp.maximum(rms(u), 1e-30)
+        change = rms(found.value) / jnp.maximum(rms(u), least)
         # Steps that change the state by a tenth; one that changes it by half is taken back.
         is_good = (change < 0.5) & (found.result == lx.RESULTS.successful)
         growth = jnp.where(is_good, jnp.clip(0.1 / jnp.maximum(change, 1e-30), 0.2, 3.0), 0.2)
@@ -398,7 +399,7 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
         return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH) & (rms(u) <= largest)
 
     # A state that grew this much, over its start or what the rate there makes of it, has no end to its growth.
-    largest = _GROWN * jnp.maximum(jnp.maximum(rms(u0), rms(rate(u0)) * dt0), 1)
+    largest = _GROWN * jnp.maximum(rms(u0), least)
     frozen = jax.lax.stop_gradient((u0, rate(u0), dt0))
     u, _, _, steps = jax.lax.while_loop(goes_on, march, (*frozen, jnp.zeros((), jnp.int32)))
     u = jax.lax.stop_gradient(u)

@@ -4,13 +4,16 @@ still, and the remaining time of a run.
 What enters: times, or a step size controller of diffrax. What leaves: the same, with those seen to.
 """
 
+import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..progress import say
 
@@ -35,9 +38,17 @@ class Advancing(diffrax.AbstractAdaptiveStepSizeController):
 
     Attributes:
         controller: what chooses the steps.
+        longest: ``(t, y, args) -> length`` of the longest step that the solver can take from a state, or None. A longer
+            one would be refused, and the run would waste it.
+        share: where given, the absolute tolerance of each species over the largest it has been in the run; else it is
+            that of the controller.
+        size: ``y -> sizes`` of the species.
     """
 
     controller: diffrax.AbstractAdaptiveStepSizeController
+    longest: Callable[..., Float[Array, ""]] | None = None
+    share: Float[Array, ""] | None = None
+    size: Callable[[Array], Array] = lambda y: jnp.max(jnp.abs(y), axis=0)
 
     @property
     def rtol(self):  # type: ignore
@@ -56,21 +67,32 @@ class Advancing(diffrax.AbstractAdaptiveStepSizeController):
 
     def wrap(self, direction):
         """The controller for a direction of time."""
-        return Advancing(self.controller.wrap(direction))  # type: ignore
+        return dataclasses.replace(self, controller=self.controller.wrap(direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """The end of the first step."""
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return end, (state, self.size(y0))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """The next step, or that there is none."""
-        keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        state, size = controller_state
+        size, controller = jnp.maximum(size, self.size(y0)), self.controller
+        if self.share is not None:
+            # Of a species that is zero the smallest number, which no error is compared with but its own zero.
+            atol = self.share * jnp.fmax(size, self.size(y1_candidate)) + jnp.finfo(jnp.result_type(size)).tiny
+            controller = eqx.tree_at(lambda c: c.atol, controller, atol[None])
+        keep, begin, end, made_jump, state, result = controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
+        if self.longest is not None:
+            y = jnp.where(keep, y1_candidate, y0)
+            # A little less, as the difference of two times is rounded.
+            end = jnp.minimum(end, begin + 0.999 * self.longest(begin, y, args).astype(jnp.result_type(end)))
         # A refused step that rounding makes as long again counts too.
         stands_still = ((end <= begin) | (~jnp.asarray(keep) & (end >= t1))) & (result == diffrax.RESULTS.successful)
         result = diffrax.RESULTS.where(stands_still, diffrax.RESULTS.dt_min_reached, result)
-        return keep, begin, end, made_jump, state, result
+        return keep, begin, end, made_jump, (state, size), result
 
 
 class TextMeter(diffrax.TextProgressMeter):

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..tables import AnyArray
-from .stabilised import FEWEST, Plan, Stabilised
+from .stabilised import FEWEST, Plan, Stabilised, is_sensible
 
 # States that are kept of a run of n fixed steps, and as many on the tape, over sqrt(n): so many that steps of up to 36
 # stages are taken again once and no more. Of adaptive steps, which are long and whose number is not known: so many.
@@ -75,13 +75,13 @@ class Rules(NamedTuple):
 
     Attributes:
         stepper: what takes them.
-        bound: ``(t, u) -> bound`` of the eigenvalues.
+        extent: ``(t, u) -> (2,)`` how far the eigenvalues extend, as of `Stabilised.extent`.
         largest: beyond it a state has overflowed.
         stop_when: ``(t, u, rate) -> bool``, or None.
     """
 
     stepper: Stabilised
-    bound: Callable[[Array, Array], Array]
+    extent: Callable[[Array, Array], Array]
     largest: Float[Array, ""]
     stop_when: Callable[[Array, Array, Array], Array] | None
 
@@ -224,11 +224,13 @@ def _forward(start: tuple[Array, Rate], rules: Rules, times: Array, marks: Marks
         k, u, slope, taken, evaluations, overflowed, stopped = walk
         begin, end = times[k], times[k + 1]
         is_done = overflowed | stopped
-        plan = rules.stepper.plan(rules.bound(begin, u), end - begin)
+        plan = rules.stepper.plan(rules.extent(begin, u), end - begin)
         # Without stages once it has ended: the bound of what is no number would ask for all of them.
         increment, _ = _increment(rate, plan, begin, u, slope, jnp.where(is_done, 0, plan.stages))
-        u = jnp.where(is_done, u, jnp.where(plan.is_stable, u + increment, jnp.nan))
-        slope = rate(end, u)
+        found, before = u + increment, slope
+        slope = rate(end, found)
+        is_good = plan.is_stable & is_sensible(plan.dt, u, increment, before, slope)
+        u = jnp.where(is_done, u, jnp.where(is_good, found, jnp.nan))
         taken = taken + (~is_done).astype(taken.dtype)
         evaluations = evaluations + jnp.where(is_done, 0, plan.stages).astype(taken.dtype)
         now = ends_at(end, u, slope)
@@ -341,11 +343,11 @@ def _backward(
             """States that the rate is taken at, up to number q of step k; to its last where q is negative."""
 
             def again(walk):
-                k, u, position, tape, positions, bounds = walk
+                k, u, position, tape, positions, extents = walk
                 t = times[k]
-                bound = rules.bound(t, u)
-                positions, bounds = positions.at[k - begin].set(position), bounds.at[k - begin].set(bound)
-                plan = rules.stepper.plan(bound, times[k + 1] - t)
+                extent = rules.extent(t, u)
+                positions, extents = positions.at[k - begin].set(position), extents.at[k - begin].set(extent)
+                plan = rules.stepper.plan(extent, times[k + 1] - t)
                 # Of a batch the longest step leads, of runs that have not ended.
                 stages = eqxi.unvmap_max(jnp.where(k < taken, plan.stages, FEWEST)).astype(k.dtype)
                 until = jnp.where(k < k_last, stages, jnp.where(q_last < 0, stages - 1, q_last))
@@ -355,24 +357,24 @@ def _backward(
 
                 increment, tape = _increment(rate, plan, t, u, rate(t, u), until, write, tape)
                 # The last increment of a step gave the first state of the next.
-                return k + 1, jnp.where(k < taken, u + increment, u), position + until, tape, positions, bounds
+                return k + 1, jnp.where(k < taken, u + increment, u), position + until, tape, positions, extents
 
             tape = jax.lax.dynamic_update_index_in_dim(tape, states[i], 0, 0)
-            positions, bounds = jnp.zeros(longest, begin.dtype), jnp.zeros(longest, times.dtype)
-            walk = (begin, states[i], jnp.zeros_like(begin), tape, positions, bounds)
+            positions, extents = jnp.zeros(longest, begin.dtype), jnp.zeros((longest, 2), times.dtype)
+            walk = (begin, states[i], jnp.zeros_like(begin), tape, positions, extents)
             return jax.lax.while_loop(lambda walk: walk[0] <= k_last, again, walk)[2:]
 
         def block(carry):
             """As far back as the tape goes."""
             k, q, sums, gradient, tape = carry
-            top, tape, positions, bounds = replay(k, q, tape)
+            top, tape, positions, extents = replay(k, q, tape)
             # A step that ends at its start wrote one state more.
             lowest = jnp.maximum(top - size + 2, 0)
 
             def step(carry):
                 k, top, sums, gradient = carry
                 t, position = times[k], positions[k - begin]
-                plan = rules.stepper.plan(bounds[k - begin], times[k + 1] - t)
+                plan = rules.stepper.plan(extents[k - begin], times[k + 1] - t)
 
                 # Increment j is d_j = mu_j d_(j-1) + nu_j d_(j-2) + dt (mu'_j f(u + d_(j-1)) + gamma'_j f(u)): its
                 # cotangent goes on to the two before, to the state in two ways, and to the rate at the start.

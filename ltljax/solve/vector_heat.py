@@ -22,13 +22,15 @@ from ..operators import laplacian_matrix
 from ..surface import Surface
 from ..tables import AnyArray, difference_matrix
 from ..vectors import check_tangent, connection, from_frame, power, to_frame
-from .distance import checked_sources, shortest_step
+from .distance import checked_sources
 from .evolve import solve
 
 # The step of heat, over the shortest that tells shortest paths, and the width of what replaces a source, over the mean
 # length of its edges: the row of one vertex does not see a source exactly where it is, many together do.
 _STEP, _WIDTH = 4, 1.5
 _RINGS = 6
+# The heat at a distance d is about exp(-d / sqrt(time)); over the size of the surface it must not leave float64.
+_DECAY = 500
 # How far below zero eigenvalues are sought from, times the area.
 _SHIFT = 1e-3
 
@@ -77,7 +79,7 @@ def transport_vectors(
     everywhere = jnp.zeros((surface.num_vertices, 3), surface.dtype).at[sources].set(vectors)
     check_tangent(surface, everywhere)
     with jax.ensure_compile_time_eval():  # inside jit too, of a surface that is not traced
-        carried, heat = _responses(surface, sources, _STEP * shortest_step(surface) if time is None else time)
+        carried, heat = _responses(surface, sources, _STEP * _shortest_step(surface) if time is None else time)
     return _mixed(surface, sources, vectors, carried, heat)
 
 
@@ -95,6 +97,12 @@ def _mixed(surface: Surface, sources, vectors: Array, carried: Array, heat: Arra
     size = jnp.sum(z**2, axis=-1)
     unit = z / jnp.sqrt(jnp.where(size > 0, size, 1))[:, None]
     return from_frame(surface, length[:, None] * unit)
+
+
+def _shortest_step(surface: Surface) -> float:
+    """The time of a step of heat that tells shortest paths (host): the squared mesh size, or what float64 can hold."""
+    diameter = float(np.linalg.norm(np.ptp(np.asarray(surface.vertices, np.float64), axis=0)))
+    return max(float(surface.mesh_size), 2 * diameter / _DECAY) ** 2
 
 
 def _responses(surface: Surface, sources: np.ndarray, time: float) -> tuple[Array, Array]:

@@ -17,7 +17,8 @@ class Kinetics(eqx.Module):
     """A reaction with its parameters.
 
     Attributes:
-        rates: ``(species, params) -> rates of change``, written for one point.
+        rates: ``(species, params) -> rates of change``, a tuple of one array for each species. Arithmetic makes it the
+            same at every vertex: a species is an array (V,). A function of a single point needs `jax.vmap`.
         params: a pytree of scalars, or of fields (V,) over the surface.
         species: the names of the species, in the order of the state's columns.
         resting: ``params -> species`` of a uniform steady state, where one is known in closed form.
@@ -55,4 +56,18 @@ def with_params(rates: Rates, species: tuple[str, ...], resting: Resting, **para
 # In reverse mode only u is kept for every evaluation, and not each product the rates are made of.
 @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=0)
 def _together(rates: Rates, u: Array, params: Any) -> Array:
-    return jnp.stack(rates(tuple(u[:, s] for s in range(u.shape[1])), params), axis=1)
+    count = u.shape[1]
+    try:
+        found = rates(tuple(u[:, s] for s in range(count)), params)
+    except ValueError as error:
+        if "values to unpack" not in str(error):
+            raise
+        raise ValueError(f"The state has {count} species, and the reaction is for another number: {error}.") from error
+    columns = (found,) if isinstance(found, jax.Array) and found.ndim < 2 and count == 1 else tuple(found)
+    if len(columns) != count or any(jnp.shape(column) not in ((), u.shape[:1]) for column in columns):
+        shapes = ", ".join(str(jnp.shape(column)) for column in columns[:5])
+        raise ValueError(
+            f"Expected the reaction to return a tuple of {count} rates, one for each species, of shape {u.shape[:1]}, "
+            f"found {len(columns)} of shape {shapes}."
+        )
+    return jnp.stack([jnp.broadcast_to(column, u.shape[:1]) for column in columns], axis=1)

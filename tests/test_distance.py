@@ -1,0 +1,136 @@
+"""Geodesic distance: exact where a surface unfolds into a plane, of first order elsewhere, and better than peers."""
+
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ltljax as ltl
+
+potpourri3d = pytest.importorskip("potpourri3d")
+igl = pytest.importorskip("igl")
+
+
+def heat_method(mesh, sources):
+    solver = potpourri3d.MeshHeatMethodDistanceSolver(mesh.vertices, mesh.faces)
+    return np.asarray(solver.compute_distance_multisource([int(source) for source in np.atleast_1d(sources)]))
+
+
+def rolled_strip(length):
+    """A strip of width 1 and of such a length, rolled up with a pitch of 1, edges of a quarter: mesh and end to end."""
+    angle = np.linspace(0, 60, 200_001)
+    radius = 0.5 + angle / (2 * np.pi)
+    curve = radius * np.exp(1j * angle)
+    along = np.append(0, np.cumsum(np.abs(np.diff(curve))))
+    curve = np.interp(np.linspace(0, length, round(4 * length) + 1), along, angle)
+    curve = (0.5 + curve / (2 * np.pi)) * np.exp(1j * curve)
+    count = len(curve)
+    vertices = np.concatenate(
+        [np.stack([curve.real, curve.imag, np.full(count, z)], axis=1) for z in np.linspace(0, 1, 5)]
+    )
+    first = (np.arange(4)[:, None] * count + np.arange(count - 1)).ravel()
+    faces = [[first, first + 1, first + count + 1], [first, first + count + 1, first + count]]
+    return ltl.Mesh(vertices, np.concatenate(np.moveaxis(faces, 1, 2))), np.abs(np.diff(curve)).sum(), count - 1
+
+
+@pytest.mark.parametrize("length", [15.6, 46.7, 93.3])
+def test_the_distance_along_a_rolled_strip_is_its_length(length):
+    mesh, exact, end = rolled_strip(length)
+    assert float(ltl.geodesic_distance(ltl.Surface.from_mesh(mesh), 0)[end]) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("scheme", [ltl.Monotone(), ltl.Polynomial(), ltl.Paper()], ids=lambda scheme: str(scheme)[:8])
+def test_distances_in_the_plane_are_exact_on_any_mesh(scheme):
+    mesh = ltl.shapes.jittered(ltl.shapes.square(n=12), 0.3, seed=1)
+    exact = np.linalg.norm(mesh.vertices - mesh.vertices[0], axis=1)
+    found = ltl.geodesic_distance(ltl.Surface.from_mesh(mesh, scheme), 0)
+    np.testing.assert_allclose(found, exact, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        ltl.shapes.icosphere,
+        lambda n: ltl.shapes.jittered_sphere(n, 0.4, seed=0),
+        lambda n: ltl.shapes.random_sphere(10 * 4**n + 2, seed=0),
+    ],
+    ids=["icosphere", "jittered", "random"],
+)
+def test_on_spheres_the_mean_error_is_of_first_order_and_below_the_heat_methods(make):
+    errors, mean_lengths = [], []
+    for level in (2, 3, 4):
+        mesh = make(level)
+        exact = np.arccos(np.clip(mesh.vertices @ mesh.vertices[0], -1, 1))
+        errors.append(np.mean(np.abs(ltl.geodesic_distance(ltl.Surface.from_mesh(mesh), 0) - exact)))
+        mean_lengths.append(mesh.mesh_size)
+    assert np.polyfit(np.log(mean_lengths), np.log(errors), 1)[0] > 0.9
+    assert errors[-1] < 0.5 * np.mean(np.abs(heat_method(mesh, 0) - exact))
+
+
+@pytest.mark.parametrize("name", ["spot_low.obj", "bunny_closed.obj", "hand_open.obj"])
+def test_on_scans_the_error_is_a_tenth_of_the_heat_methods(name, real_mesh):
+    mesh = ltl.load_mesh(real_mesh(name))
+    surface = ltl.Surface.from_mesh(mesh)
+    exact = ltl.geodesic_distance(surface, 0, method="exact")
+    found = np.abs(ltl.geodesic_distance(surface, 0) - exact)
+    peer = np.abs(heat_method(mesh, 0) - exact)
+    assert found.mean() < 0.1 * peer.mean()
+    assert found.max() < 0.2 * peer.max()
+
+
+def test_from_a_boundary_and_from_a_disc_of_sources_the_error_is_of_first_order_and_below_the_heat_methods():
+    for sources_of, exact_of in (
+        (lambda x: np.minimum(x, 1 - x).min(axis=1) < 1e-9, lambda x: np.minimum(x, 1 - x).min(axis=1)),
+        (lambda x: np.linalg.norm(x - 0.5, axis=1) < 0.2, None),
+    ):
+        errors = []
+        for n in (16, 32):
+            mesh = ltl.shapes.square(n=n)
+            x = mesh.vertices[:, :2]
+            sources = np.flatnonzero(sources_of(x))
+            nearest = np.linalg.norm(x[:, None] - x[None, sources], axis=2).min(axis=1)
+            exact = nearest if exact_of is None else exact_of(x)
+            found = ltl.geodesic_distance(ltl.Surface.from_mesh(mesh), sources)
+            assert not np.asarray(found)[sources].any()
+            errors.append(np.mean(np.abs(found - exact)))
+            assert errors[-1] < 0.5 * np.mean(np.abs(heat_method(mesh, sources) - exact))
+        assert errors[1] < 0.85 * errors[0]
+
+
+def test_exact_distances_are_those_of_the_polyhedron():
+    mesh = ltl.shapes.icosphere(3)
+    found = ltl.geodesic_distance(ltl.Surface.from_mesh(mesh), 0, method="exact")
+    angle = np.arccos(np.clip(mesh.vertices @ mesh.vertices[0], -1, 1))
+    # A polyhedron inside the sphere has shorter paths, to second order.
+    assert (found <= angle + 1e-12).all()
+    assert np.abs(found - angle).max() < 0.01
+
+
+def test_exact_distances_without_libigl_say_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "igl", None)
+    with pytest.raises(ImportError, match="pip install libigl"):
+        ltl.geodesic_distance(ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), 0, method="exact")
+
+
+def test_distance_from_several_sources_is_that_from_the_nearest():
+    mesh = ltl.shapes.icosphere(3)
+    surface = ltl.Surface.from_mesh(mesh)
+    poles = [int(np.argmax(mesh.vertices[:, 2])), int(np.argmin(mesh.vertices[:, 2]))]
+    exact = np.arccos(np.clip(np.abs(mesh.vertices[:, 2]), 0, 1))
+    assert np.max(np.abs(ltl.geodesic_distance(surface, poles) - exact)) < 0.04
+    count = mesh.num_vertices
+    two = ltl.Mesh(np.concatenate([mesh.vertices, mesh.vertices + 5]), np.concatenate([mesh.faces, mesh.faces + count]))
+    apart, alone = ltl.Surface.from_mesh(two), ltl.geodesic_distance(surface, 0)
+    for method in ("marching", "exact"):
+        found = ltl.geodesic_distance(apart, 0, method=method)
+        np.testing.assert_allclose(found[:count], ltl.geodesic_distance(surface, 0, method=method), atol=1e-9)
+        assert jnp.isinf(found[count:]).all()
+    both = ltl.geodesic_distance(apart, [0, count])
+    np.testing.assert_allclose(both, np.tile(alone, 2), atol=1e-9)
+
+
+@pytest.mark.parametrize("sources", [[10**6], [-1], []])
+def test_what_is_no_source_is_refused(sources):
+    with pytest.raises(ValueError, match="source vertices from 0"):
+        ltl.geodesic_distance(ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), np.array(sources, int))

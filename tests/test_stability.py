@@ -1,0 +1,137 @@
+"""Steps are stable on meshes whose rows are not symmetric, whatever the solver and the length of steps, or refused."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import ltljax as ltl
+from ltljax.solve.checks import longest_step
+from ltljax.solve.stabilised import is_sensible
+
+RANGE = 1.02
+
+
+def noise(surface, seed):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=surface.num_vertices))
+
+
+def largest(surface, u0, dt, solver, steps=20):
+    """The largest value of a run of heat over that of its start; None if the solver refuses steps of this length."""
+    times = np.arange(1, steps + 1) * dt
+    try:
+        found = ltl.solve(ltl.Diffusion(), surface, u0, times[-1], ts=times, solver=solver, dt=dt)
+    except ValueError as error:
+        return None if "is too long for" in str(error) else np.inf
+    return float(jnp.max(jnp.abs(found.us)) / jnp.max(jnp.abs(u0)))
+
+
+@pytest.mark.parametrize(
+    "make", [ltl.shapes.random_sphere, lambda n, seed: ltl.shapes.jittered_torus(40, 20, 0.4, seed)]
+)
+def test_the_spectral_width_is_that_of_the_eigenvalues(make):
+    surface = ltl.Surface.from_mesh(make(700, seed=3))
+    values = scipy.linalg.eigvals(ltl.laplacian_matrix(surface).todense())
+    values = values[np.abs(values) > 1e-6]
+    exact = np.max(values.imag**2 / -values.real)
+    assert exact <= float(ltl.spectral_width(surface)) <= 1.6 * exact
+
+
+def test_a_traced_surface_is_given_a_width_that_is_safe():
+    for seed in range(3):
+        surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=seed))
+        assert float(jax.jit(ltl.spectral_width)(surface)) >= float(ltl.spectral_width(surface))
+
+
+@pytest.mark.parametrize("solver", [ltl.RKL2, ltl.RKL1])
+@pytest.mark.parametrize(("bound", "width"), [(5, 0), (100, 0), (100, 1), (100, 5), (1000, 10), (3000, 9), (30, 4)])
+def test_no_stage_polynomial_grows_inside_its_parabola(solver, bound, width):
+    plan = solver().plan(jnp.array([bound, width], float), 1.0)
+    assert bool(plan.is_stable)
+    x = np.linspace(0, bound, 2000)[1:]
+    z = (-x + 1j * np.sqrt(width * x) * np.linspace(0, 1, 9)[:, None]).ravel()
+    before, last = np.zeros_like(z), float(plan.mu_rate[1]) * z
+    for j in range(2, int(plan.stages) + 1):
+        mu, nu, mu_rate, gamma_rate = map(float, plan.coefficients(jnp.array(j)))
+        before, last = last, mu * last + nu * before + mu_rate * z * (1 + last) + gamma_rate * z
+    assert np.abs(1 + last).max() <= 1 + 1e-9
+    assert float(plan.c[int(plan.stages)]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1, 1.0])
+def test_fixed_steps_keep_the_range_of_heat_on_random_points_or_are_refused(dt):
+    for seed in range(4):
+        surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=seed))
+        for solver in (ltl.RKL2(), ltl.RKL1()):
+            found = largest(surface, noise(surface, seed), dt, solver)
+            assert found is None or found <= RANGE
+            # At short steps none is refused.
+            assert found is not None or dt > 0.05
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [ltl.CrankNicolson(), ltl.BackwardEuler(), ltl.TRBDF2(), ltl.SBDF2(), diffrax.KenCarp3(), diffrax.Kvaerno3()],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_implicit_steps_keep_the_range_of_heat_on_random_points(solver):
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=0))
+    for dt in (1e-2, 1.0):
+        found = largest(surface, noise(surface, 0), dt, solver)
+        assert found is not None
+        assert found <= RANGE
+
+
+def test_explicit_steps_are_stable_up_to_the_length_that_is_said():
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=1))
+    values = scipy.linalg.eigvals(ltl.laplacian_matrix(surface).todense())
+    length = longest_step(diffrax.Heun(), np.abs(values).max(), float(ltl.spectral_width(surface)))
+    for dt, is_stable in ((0.95 * length, True), (1.1 * length, False)):
+        found = largest(surface, noise(surface, 1), dt, diffrax.Heun(), steps=50)
+        assert (found is not None) == is_stable
+        assert found is None or found <= RANGE
+
+
+def test_adaptive_steps_are_hardly_ever_refused_on_random_points():
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=0))
+    x = surface.vertices[:, 0]
+    counts = ltl.solve(ltl.Diffusion(), surface, x + x**3, 1.0, solver=ltl.RKL2()).counts
+    assert counts["num_rejected_steps"] <= 0.05 * counts["num_steps"]
+
+
+def test_the_cost_of_damping_is_below_twice_the_stages():
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=0))
+    bound, width = float(ltl.spectral_bound(surface)), float(ltl.spectral_width(surface))
+    for dt in (1e-3, 5e-3, 2e-2):
+        damped, plain = (ltl.RKL2().plan(jnp.array([bound, chi]), dt).stages for chi in (width, 0.0))
+        assert plain <= damped <= 2 * plain
+
+
+def test_a_step_that_is_nonsense_ends_the_run_with_an_error():
+    # A solver that is told of eigenvalues on the axis, as if the mesh were symmetric.
+    surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(3000, seed=3))
+    blind = ltl.RKL2(spectral_width=lambda t, u, args: jnp.zeros(()))
+    u0 = noise(surface, 3)
+    with pytest.raises(ltl.SolveError, match="overflowed"):
+        ltl.solve(ltl.Diffusion(), surface, u0, 2.0, solver=blind, dt=0.02)
+    found = ltl.solve(ltl.Diffusion(), surface, u0, 2.0, solver=blind, dt=0.02, throw=False)
+    assert bool(found.overflowed)
+
+
+def test_steps_of_rough_data_and_of_sources_that_begin_are_not_taken_for_nonsense():
+    one = jnp.ones((5, 1))
+    assert bool(is_sensible(jnp.array(1.0), one, -0.5 * one, -1e6 * one, -1e5 * one))
+    assert bool(is_sensible(jnp.array(1.0), 0 * one, 0 * one, 0 * one, 1e6 * one))
+    assert not bool(is_sensible(jnp.array(1.0), one, one, one, 1e3 * one))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [1e-3, 1e-2, 3e-2, 1e-1, 1.0])
+def test_a_hundred_random_spheres_keep_the_range_of_heat_or_refuse(dt):
+    for seed in range(100):
+        surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(3000, seed=seed))
+        for solver in (ltl.RKL2(), ltl.RKL1()):
+            found = largest(surface, noise(surface, seed), dt, solver)
+            assert found is None or found <= RANGE
