@@ -29,7 +29,8 @@ class ReactionDiffusion(Equation):
 
     Attributes:
         diffusivity: for each species how it spreads: a number D for D Delta u; a non-negative field (V,) for
-            div(D grad u); an `EllipticStencil` for D : Hess u + b . grad u, such as diffusion along a direction field
+            div(D grad u), which may jump, and through a zero of which nothing flows (`weighted_laplacian` with the
+            harmonic mean); an `EllipticStencil` for D : Hess u + b . grad u, such as diffusion along a direction field
             or drift with a flow (b is minus the velocity). (S,) where all are numbers, else a tuple.
         reaction: a `Kinetics`, or a plain function ``((u, v), params) -> (du, dv)`` of the species, each an array (V,)
             over the vertices: what is written in arithmetic holds at every one of them. A function of a single point,
@@ -169,4 +170,4 @@ def _spread(surface: Surface, spread: Spread, u: Float[Array, " V"]) -> Float[Ar
     if isinstance(spread, EllipticStencil):
         return spread(u)
     conductivity = jnp.broadcast_to(spread.astype(u.dtype), u.shape)
-    return weighted_laplacian(surface, conductivity, u)
+    return weighted_laplacian(surface, conductivity, u, "harmonic")
