@@ -136,12 +136,14 @@ def weighted_laplacian(
     """div(g grad u) for a conductivity g, as sum_k c[k] g[k] (u_k - u_v) over the Laplacian's weights c, g[k] the mean
     of the conductivities at both ends.
 
-    The arithmetic mean serves a smooth g. The harmonic mean, ``2 g_k g_v / (g_k + g_v)``, serves a g that jumps: it is
+    The arithmetic mean serves a smooth g. The harmonic mean, ``2 g_k g_v / (g_k + g_v)``, serves a g that jumps. It is
     that of two conductors in a row, so that nothing flows to where g is zero: a wall of such vertices keeps its two
     sides apart, but for the few rows that reach over two rings where it is one vertex wide (none on icospheres, 2 of
-    1,182 beside a wall on a jittered sphere). Of the Laplacian's order where g is smooth; with ``Monotone`` and g >= 0 the weights stay non-negative and the maximum principle
-    holds. On a boundary, for fields whose normal derivative vanishes. g may depend on u, which makes diffusion
-    nonlinear.
+    1,182 beside a wall on a jittered sphere).
+
+    Of the Laplacian's order where g is smooth; with ``Monotone`` and g >= 0 the weights stay non-negative and the
+    maximum principle holds. On a boundary, for fields whose normal derivative vanishes. g may depend on u, which makes
+    diffusion nonlinear.
 
     Args:
         surface: the surface.
@@ -156,6 +158,8 @@ def weighted_laplacian(
     _check_rows(surface, conductivity, "conductivity")
     if mean not in ("arithmetic", "harmonic"):
         raise ValueError(f'Expected the mean "arithmetic" or "harmonic", found {mean!r}.')
+    if mean == "harmonic" and surface.topology.diffusion is None:
+        raise ValueError(f"The harmonic mean is one of two neighbours, which {surface.scheme} has no weights for.")
     table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
     if table is None or weights is None:
         x, y = _gradient_in_frame(surface, u)

@@ -179,3 +179,37 @@ def test_the_evolving_ellipsoid_is_solved_at_order_two():
     errors = [evolving_ellipsoid(level) for level in (2, 3)]
     assert np.log2(errors[0] / errors[1]) > 1.8
     assert errors[1] < 0.04
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_wall_of_no_conductivity_keeps_its_sides_apart(width):
+    mesh = ltl.shapes.icosphere(3)
+    surface = ltl.Surface.from_mesh(mesh)
+    height = mesh.vertices[:, 2]
+    below = height < 0
+    wall = np.zeros(mesh.num_vertices, bool)
+    for _ in range(width):
+        behind = below | wall
+        is_rim = behind[mesh.edges[:, 0]] != behind[mesh.edges[:, 1]]
+        wall[mesh.edges[is_rim].ravel()[~behind[mesh.edges[is_rim].ravel()]]] = True
+    equation = ltl.ReactionDiffusion((jnp.where(wall, 0.0, 1.0),), lambda species, _: (0 * species[0],))
+    # What the wall itself holds does not matter.
+    u0 = jnp.where(wall, 99.0, jnp.where(below, 1.0, 0.0))[:, None]
+    end = ltl.solve(equation, surface, u0, 0.3, solver=ltl.TRBDF2()).u_end[:, 0]
+    np.testing.assert_allclose(end[below], 1, atol=1e-6)
+    np.testing.assert_allclose(end[~below & ~wall], 0, atol=1e-6)
+    np.testing.assert_allclose(end[wall], 99, rtol=1e-6)
+
+
+def test_both_means_of_a_smooth_conductivity_are_of_the_same_order():
+    errors = {"arithmetic": [], "harmonic": []}
+    for level in (3, 4):
+        surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
+        x, _, z = surface.vertices.T
+        # g = 2 + z, u = x: div(g grad u) = g Delta x + grad z . grad x, and the latter is -x z on the unit sphere.
+        exact = -2 * (2 + z) * x - x * z
+        for mean, found in errors.items():
+            found.append(float(jnp.sqrt(jnp.mean((ltl.weighted_laplacian(surface, 2 + z, x, mean) - exact) ** 2))))
+    for found in errors.values():
+        assert found[1] < 0.4 * found[0]
+        assert found[1] < 0.02

@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import ltljax as ltl
@@ -349,6 +350,19 @@ def field_diffusion(field):
     return ltl.ReactionDiffusion((field,), lambda species, _: (0 * species[0],))
 
 
+def two_rates(species, _):
+    u, v = species
+    return -u, -v
+
+
+def one_rate(species, _):
+    return (-species[0],)
+
+
+def no_tuple(species, _):
+    return -species[0]
+
+
 WRONG = {
     "negative diffusivity": (dict(equation=ltl.Diffusion(-1.0)), "not negative, found -1"),
     "a diffusivity of a species that is negative": (
@@ -371,7 +385,27 @@ WRONG = {
     "a step that is not positive": (dict(dt=0.0), "dt = 0.0"),
     "an explicit step too long": (dict(dt=0.5, solver=diffrax.Tsit5()), "too long for Tsit5"),
     "SBDF2 without steps": (dict(solver=ltl.SBDF2()), "SBDF2 takes fixed steps"),
-}
+    "to resume without a folder": (dict(resume=True), "resume=True needs the folder"),
+    "intervals without a folder": (dict(checkpoint_every=0.1), "checkpoint_every=0.1 needs the folder"),
+    "settings of a solver that would have no effect": (
+        dict(solver=diffrax.Kvaerno3(root_finder=optx.Newton(1e-3, 1e-3))), "a root_finder, which would have no effect",
+    ),
+    "a masked state": (dict(u0=np.ma.masked_greater(np.arange(162.0), 100)), "u0 as a plain array, found a masked one"),
+    "a state of dates": (dict(u0=np.full(162, "2026-01-01", "datetime64[D]")), r"u0 as real numbers, found the type dat"),
+    "a state of digits": (dict(u0=np.full(162, "1")), "u0 as real numbers, found the type <U1"),
+    "times of digits": (dict(ts=["0.5", "1"]), "ts as real numbers"),
+    "a reaction of another number of species": (
+        dict(equation=ltl.ReactionDiffusion((1.0, 1.0, 1.0), two_rates), u0=jnp.ones((162, 3))),
+        "The state has 3 species, and the reaction is for another number",
+    ),
+    "a reaction with one rate for two species": (
+        dict(equation=ltl.ReactionDiffusion((1.0, 1.0), one_rate), u0=jnp.ones((162, 2))),
+        r"a tuple of 2 rates, one for each species, of shape \(162,\), found 1",
+    ),
+    "a reaction with a rate that is no tuple": (
+        dict(equation=ltl.ReactionDiffusion((1.0, 1.0), no_tuple), u0=jnp.ones((162, 2))), "a tuple of 2 rates",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -444,3 +478,16 @@ def test_a_fixed_step_that_is_unstable_is_said_first(sphere):
         ltl.SolveError, match=r"overflowed.* Causes are \(a\) a dt beyond what the solver is stable for"
     ):
         ltl.solve(stiffening, sphere, 0 * sphere.vertices[:, :1], 1.0, solver=diffrax.Heun(), dt=0.02)
+
+
+@pytest.mark.parametrize("dt", [None, 0.01])
+def test_times_after_the_stop_are_nan_and_the_state_there_is_u_end(sphere, dt):
+    u0 = sphere.vertices[:, 0]
+    found = ltl.solve(
+        ltl.Diffusion(), sphere, u0, 1.0, ts=[0.1, 0.9], dt=dt, stop_when=lambda t, u, rate: jnp.max(u) < 0.5
+    )
+    assert bool(found.stopped)
+    assert 0.1 < float(found.t_end) < 0.9
+    assert np.isfinite(found.us[0]).all()
+    assert np.isnan(found.us[1]).all()
+    assert float(jnp.max(found.u_end)) < 0.5
