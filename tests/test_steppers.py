@@ -390,8 +390,8 @@ WRONG = {
     "settings of a solver that would have no effect": (
         dict(solver=diffrax.Kvaerno3(root_finder=optx.Newton(1e-3, 1e-3))), "a root_finder, which would have no effect",
     ),
-    "a masked state": (dict(u0=np.ma.masked_greater(np.arange(162.0), 100)), "u0 as a plain array, found a masked"),
-    "a state of dates": (dict(u0=np.full(162, "2026-01-01", "datetime64[D]")), r"u0 as real numbers, found the type dat"),
+    "a masked state": (dict(u0=np.ma.masked_greater(np.arange(162.0), 9)), "u0 as a plain array, found a masked"),
+    "a state of dates": (dict(u0=np.full(162, "2026", "datetime64[Y]")), "u0 as real numbers, found the type dat"),
     "a state of digits": (dict(u0=np.full(162, "1")), "u0 as real numbers, found the type <U1"),
     "times of digits": (dict(ts=["0.5", "1"]), "ts as real numbers"),
     "a reaction of another number of species": (
