@@ -11,6 +11,7 @@ import optimistix as optx
 import pytest
 
 import ltljax as ltl
+from ltljax.mesh.arguments import as_numbers
 
 # Solver, order, and the fewest and most fixed steps of the interval.
 SOLVERS = {
@@ -391,9 +392,6 @@ WRONG = {
         dict(solver=diffrax.Kvaerno3(root_finder=optx.Newton(1e-3, 1e-3))), "a root_finder, which would have no effect",
     ),
     "a masked state": (dict(u0=np.ma.masked_greater(np.arange(162.0), 9)), "u0 as a plain array, found a masked"),
-    "a state of dates": (dict(u0=np.full(162, "2026", "datetime64[Y]")), "u0 as real numbers, found the type dat"),
-    "a state of digits": (dict(u0=np.full(162, "1")), "u0 as real numbers, found the type <U1"),
-    "times of digits": (dict(ts=["0.5", "1"]), "ts as real numbers"),
     "a reaction of another number of species": (
         dict(equation=ltl.ReactionDiffusion((1.0, 1.0, 1.0), two_rates), u0=jnp.ones((162, 3))),
         "The state has 3 species, and the reaction is for another number",
@@ -491,3 +489,26 @@ def test_times_after_the_stop_are_nan_and_the_state_there_is_u_end(sphere, dt):
     assert np.isfinite(found.us[0]).all()
     assert np.isnan(found.us[1]).all()
     assert float(jnp.max(found.u_end)) < 0.5
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.ma.masked_greater(np.arange(5.0), 3),
+        np.full(5, "2026", "datetime64[Y]"),
+        np.full(5, "1"),
+        ["0.5", "1"],
+        np.datetime64("2026"),
+        np.ones(5, complex),
+        np.array([1, None]),
+    ],
+    ids=["masked", "dates", "digits", "a list of digits", "a date", "complex", "objects"],
+)
+def test_what_would_lose_something_as_numbers_is_refused(value):
+    with pytest.raises(ValueError, match="Expected u0 as"):
+        as_numbers("u0", value)
+
+
+def test_numbers_of_all_kinds_are_let_through():
+    for value in (1, 2.0, True, [1, 2.5], np.arange(3), np.float32(1), jnp.ones(3), [jnp.ones(()), 2]):
+        assert as_numbers("u0", value) is value
