@@ -98,7 +98,7 @@ from .solve import (
     steady_state,
     transport_vectors,
 )
-from .surface import Surface
+from .surface import FarFromOriginWarning, Surface
 from .vectors import (
     Connection,
     connection,
@@ -141,6 +141,7 @@ __all__ = [
     "Experiment",
     "Explanation",
     "Factorized",
+    "FarFromOriginWarning",
     "Fit",
     "FitError",
     "GradientCheck",

@@ -1,7 +1,9 @@
-"""How far a long piece of work is, said on the terminal, and how long its parts took."""
+"""What is said on the terminal: how far a long piece of work is, how long its parts took, and what there is to note."""
 
+import contextlib
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -39,6 +41,18 @@ def say(what: str, share: float, start: float) -> None:
     """Print how much of a work is done, and how long the rest will take if it goes on as since the start."""
     left = (time.perf_counter() - start) * (1 - share) / max(share, 1e-9)
     print(f"{what}: {100 * share:.0f} %, about {left:.0f} s left", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def noted(*ignored: type[Warning]) -> Iterator[None]:
+    """Prints the warnings of the work inside as notes, after it, except those of some categories."""
+    with warnings.catch_warnings(record=True) as cautions:
+        warnings.simplefilter("always")
+        for category in ignored:
+            warnings.simplefilter("ignore", category)
+        yield
+    for caution in cautions:
+        print(f"note: {caution.message}")
 
 
 class Laps:

@@ -4,7 +4,6 @@ What enters: a `Scenario`. What leaves: a folder with a report, a picture, and t
 """
 
 import json
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import tomli_w
 from .fit import Experiment, Fit, Observations, Positive, fit
 from .lifting.schemes import Scheme
 from .scenario import Scenario
-from .surface import Surface
+from .surface import FarFromOriginWarning, Surface
 
 
 def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Path] = (), resume: bool = False) -> Fit:
@@ -49,11 +48,8 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Pa
 
     folder.check_fit_folder(out, (*inputs, *example.files.values(), *wanted.files))
     out.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(record=True) as cautions:
-        warnings.simplefilter("always")
+    with noted(FarFromOriginWarning):
         surface = Surface.from_mesh(example.mesh, scheme, example.settings.dtype)
-    for caution in cautions:
-        print(f"note: {caution.message}")
     settings = example.settings
     experiment = Experiment(
         lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),

@@ -23,11 +23,11 @@ import tomli_w
 from .lifting.schemes import Monotone, Scheme
 from .mesh import Mesh
 from .operators import integrate
-from .progress import watched
+from .progress import noted, watched
 from .scenario import Scenario
 from .solve import GrowingModesWarning, SolveError, solve
 from .solve.restart import Keeper, fingerprint
-from .surface import Surface
+from .surface import FarFromOriginWarning, Surface
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
 # Vertices from which on building a surface takes long enough to be watched.
@@ -86,12 +86,13 @@ def run(
     out.mkdir(parents=True, exist_ok=True)
     mesh = example.mesh
     start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as cautions:
-        warnings.simplefilter("always")
+    # Results are written where the mesh lies, wherever the surface takes positions from.
+    with noted(FarFromOriginWarning):
         surface = Surface.from_mesh(mesh, scheme, dtype, progress=mesh.num_vertices > _LONG_BUILD)
-    build_seconds = time.perf_counter() - start
-    print(f"{example.name} on {options['mesh']}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, {scheme}")
-    _print_notes((*example.notes, *cautions))
+        build_seconds = time.perf_counter() - start
+        print(f"{example.name} on {options['mesh']}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, {scheme}")
+        for note in example.notes:
+            print(f"note: {note}")
 
     reached = _Progress([0.0], [example.u0])
     times = np.linspace(0, example.t1, frames + 1)
@@ -154,11 +155,9 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
         print(f"note: going on from t = {reached.times[-1]:g}")
     u = jnp.asarray(reached.states[-1], surface.dtype)
     start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as cautions:
-        warnings.simplefilter("always")
+    with noted():
         # From a time to itself: nothing to step, everything to compile.
         jax.block_until_ready(solve(equation, surface, u, 0.0, t0=0.0, **how).us)
-    _print_notes(cautions)
     reached.compile_seconds = time.perf_counter() - start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GrowingModesWarning)  # said once
@@ -173,11 +172,6 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
             reached.states.append(np.asarray(u))
             solution.check(surface)
             keeper.keep(reached.states[-1], dict(t=reached.times[-1], counts=dict(reached.counts)))
-
-
-def _print_notes(notes: Iterable[str | warnings.WarningMessage]) -> None:
-    for note in notes:
-        print(f"note: {note.message if isinstance(note, warnings.WarningMessage) else note}")
 
 
 def _measure(example: Scenario, surface: Surface, reached: _Progress) -> dict[str, Any]:

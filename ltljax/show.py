@@ -106,7 +106,8 @@ def displaced(surface: Surface, u: Float[AnyArray, " V"], amount: float = 0.1) -
     if not np.isfinite(values).all():
         raise ValueError(f"Expected finite values, found {values[~np.isfinite(values)][0]}.")
     vertices, normals = (np.asarray(array, np.float64) for array in (surface.vertices, surface.normals))
-    return Mesh(texture.displaced(vertices, normals, values, amount), np.asarray(surface.faces))
+    relief = texture.displaced(vertices, normals, values, amount) + surface.centre
+    return Mesh(relief, np.asarray(surface.faces))
 
 
 def plot_dispersion(dispersion: Dispersion, eigenvalues: AnyArray | None = None, axes: Any = None) -> Any:

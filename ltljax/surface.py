@@ -7,6 +7,7 @@ everything is a pure function of them.
 import contextlib
 import dataclasses
 import functools
+import warnings
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -21,23 +22,34 @@ from jaxtyping import Array, Float, Int
 from .conservation import stationary_measure
 from .construction import SurfaceReport, freeze, warn_of_rows, with_reverse
 from .lifting.schemes import Geometry, Monotone, Scheme, Topology, weigh
-from .mesh import Mesh
+from .mesh import Mesh, far_middle
 from .progress import Laps, watched
 from .tables import AnyArray, difference_matrix, slot_sum
+
+
+class FarFromOriginWarning(UserWarning):
+    """The mesh lies far from the origin, so that the positions of its surface are relative to ``surface.centre``."""
 
 
 class Surface(eqx.Module):
     """A triangle mesh with everything the operators need, as a pytree.
 
+    Positions are relative to ``centre``, so that they keep their digits in float32 wherever the mesh lies. The centre
+    is the origin, and positions are those of the mesh, unless the middle of the mesh is farther from the origin than
+    twice its size. This holds for ``surface.vertices``, for what `with_vertices` is given, for the positions that
+    sources, boundary data and motions are called with, and for the positions that a function of a surface returns.
+
     Attributes:
         topology: the tables that stay when vertices move.
         geometry: the arrays that depend on the positions.
         scheme: `Monotone`, `Polynomial` or `Paper`.
+        centre_parts: (2, 3), whose sum is the centre: float32 holds it in double precision so.
         report: what the construction found (host).
     """
 
     topology: Topology
     geometry: Geometry
+    centre_parts: Float[Array, "2 3"]
     scheme: Scheme = eqx.field(static=True)
     report: SurfaceReport = eqx.field(static=True)
 
@@ -65,6 +77,7 @@ class Surface(eqx.Module):
         Warns:
             InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row and could not use
                 the cotangent row, or `Polynomial` found no neighbours that determine its fit.
+            FarFromOriginWarning: positions are relative to ``surface.centre``.
         """
         if not isinstance(mesh, Mesh):
             raise TypeError(
@@ -79,9 +92,10 @@ class Surface(eqx.Module):
         if differentiable:
             topology = with_reverse(topology)
             laps.end("reversed tables")
+        centre = far_middle(mesh.vertices)
         # On the host in NumPy, where float64 is always at hand and nothing has to be compiled for the mesh's size.
         with np.errstate(over="ignore"):  # an overflow of the cast is found below
-            geometry = weigh(scheme, mesh.vertices, topology, angles)
+            geometry = weigh(scheme, mesh.vertices - centre, topology, angles)
             geometry = jax.tree.map(lambda leaf: leaf.astype(dtype), geometry)
         if not _is_in_range(geometry):
             raise ValueError(
@@ -89,10 +103,19 @@ class Surface(eqx.Module):
                 f"{jnp.dtype(dtype).name}. Rescale the mesh (mesh.scaled(factor)) or use float64."
             )
         warn_of_rows(report, scheme, stacklevel=2)
-        topology, geometry = jax.device_put((topology, geometry))
+        if centre.any():
+            warnings.warn(
+                f"The mesh lies far from the origin: the positions of its surface are relative to surface.centre, "
+                f"{_in_words(centre)}.",
+                FarFromOriginWarning,
+                stacklevel=2,
+            )
+        coarse = centre.astype(dtype)
+        centre_parts = np.stack([coarse, (centre - coarse).astype(dtype)])
+        topology, geometry, centre_parts = jax.device_put((topology, geometry, centre_parts))
         laps.end("weights")
         report = dataclasses.replace(report, seconds=laps.seconds)
-        return cls(topology, geometry, scheme, report)
+        return cls(topology, geometry, centre_parts, scheme, report)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with its vertices moved and every weight recomputed, on the same support.
@@ -100,9 +123,21 @@ class Surface(eqx.Module):
         Pure, differentiable in the vertices and jit-compiled, without work on the host. The support, with the flips of
         the intrinsic triangulation, is the one chosen for the mesh it was built from: after a large deformation build a
         new surface. In float32, rows whose edges differ in length by more than a thousand times lose their accuracy.
+
+        Args:
+            vertices: the new positions, relative to ``surface.centre``.
+
+        Raises:
+            ValueError: there are not as many vertices as before, or they lie far from where they are taken from, which
+                positions relative to another point do.
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")
+        if not isinstance(vertices, Tracer) and (middle := far_middle(np.asarray(vertices))).any():
+            raise ValueError(
+                f"Expected positions relative to surface.centre, found positions about {_in_words(middle)}. Take the "
+                "centre from them in double precision, or build a new surface of a mesh."
+            )
         # In the widest float that JAX has switched on, and cast last.
         vertices = jnp.asarray(vertices, _float_dtype(None))
         geometry = _weigh(self.scheme, vertices, self.topology)
@@ -118,8 +153,13 @@ class Surface(eqx.Module):
         return width * jnp.mean(slot_sum(table, geometry.laplacian_weights)) / jnp.mean(slot_sum(table, weights))
 
     @property
+    def centre(self) -> np.ndarray:
+        """The point from which positions are taken, (3,) in the coordinates of the mesh, in double precision (host)."""
+        return np.asarray(self.centre_parts, np.float64).sum(axis=0)
+
+    @property
     def vertices(self) -> Float[Array, "V 3"]:
-        """Positions."""
+        """Positions, relative to ``centre``."""
         return self.geometry.vertices
 
     @property
@@ -211,6 +251,10 @@ def _is_in_range(geometry: Geometry) -> bool:
     is_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry))
     least = np.finfo(squares[0].dtype).tiny / np.finfo(squares[0].dtype).eps
     return is_finite and all(leaf.size == 0 or np.abs(leaf).max() > least for leaf in squares)
+
+
+def _in_words(point: np.ndarray) -> str:
+    return f"({', '.join(f'{x:.6g}' for x in point)})"
 
 
 def _float_dtype(dtype):

@@ -50,8 +50,8 @@ MAY_IMPORT = {
         "progress",
         "output",
     },
-    "fit": {"equations", "operators", "surface", "tables", "solve", "progress", "output"},
-    "output": set(),
+    "fit": {"mesh", "equations", "operators", "surface", "tables", "solve", "progress", "output"},
+    "output": {"mesh"},
     "show": {"mesh", "surface", "solve", "tables", "output"},
     "scenario": {
         "curvature",
@@ -66,8 +66,19 @@ MAY_IMPORT = {
         "output",
     },
     "run": {"scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
-    "recover": {"scenario", "fit", "lifting", "surface", "output"},
-    "process": {"curvature", "mesh", "lifting", "operators", "vectors", "surface", "solve", "imaging", "output"},
+    "recover": {"scenario", "fit", "lifting", "surface", "output", "progress"},
+    "process": {
+        "curvature",
+        "mesh",
+        "lifting",
+        "operators",
+        "vectors",
+        "surface",
+        "solve",
+        "imaging",
+        "output",
+        "progress",
+    },
     "cli": {"scenario", "process", "run", "recover", "fit", "mesh", "lifting", "solve"},
 }
 NO_JAX = [

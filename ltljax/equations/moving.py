@@ -22,7 +22,7 @@ class Moving(Equation):
     Attributes:
         equation: what happens on the surface, such as `ReactionDiffusion`.
         motion: ``(t, vertices) -> vertices``: where the vertices of the given surface are at a time; differentiable.
-            A scale that grows is ``lambda t, x: jnp.exp(0.1 * t) * x``.
+            A scale that grows is ``lambda t, x: jnp.exp(0.1 * t) * x``. Positions are relative to ``surface.centre``.
 
     Source: Crampin, Gaffney and Maini (1999), doi:10.1006/bulm.1999.0131, equation 2; on surfaces Dziuk and Elliott
     (2007), doi:10.1093/imanum/drl023, equation 1.1.

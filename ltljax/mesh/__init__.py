@@ -8,7 +8,7 @@ from . import shapes
 from .errors import MeshError
 from .files import load_mesh
 from .mesh import Mesh
-from .report import MeshReport, corner_angles
+from .report import MeshReport, corner_angles, far_middle
 from .topology import OneRings, half_edges, k_ring, one_rings, shared_edges
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "MeshReport",
     "OneRings",
     "corner_angles",
+    "far_middle",
     "half_edges",
     "k_ring",
     "load_mesh",

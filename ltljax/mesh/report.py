@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+# How many times its own size a shape may lie from the origin without being far from it.
+_FAR = 2
+
 
 @dataclasses.dataclass(frozen=True)
 class MeshReport:
@@ -107,6 +110,17 @@ def corner_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     behind = np.roll(corners, -2, axis=1) - corners
     # atan2 keeps its accuracy at angles close to 0 and to pi, where arccos loses half the digits.
     return np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), np.sum(ahead * behind, axis=2))
+
+
+def far_middle(vertices: np.ndarray) -> np.ndarray:
+    """The middle of a shape's bounding box, where that is farther from the origin than twice its size; else zero.
+
+    So far away float32 would blur the shape, unless positions are taken from the middle.
+    """
+    low, high = (np.asarray(end, np.float64) for end in (vertices.min(axis=0), vertices.max(axis=0)))
+    middle = (low + high) / 2
+    # By `hypot`, which neither overflows nor underflows. Positions that are no numbers are not far.
+    return middle if np.hypot.reduce(middle) > _FAR * np.hypot.reduce(high - low) else np.zeros(3)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -8,15 +8,27 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import trimesh
+
+from ..mesh import far_middle
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
-    """Write a binary PLY with per-vertex colours (V, 4) of unsigned bytes."""
-    surface = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
-    data = surface.export(file_type="ply")
-    assert isinstance(data, bytes)
-    path.write_bytes(data)
+    """Write a binary PLY with per-vertex colours (V, 3) or (V, 4) of unsigned bytes.
+
+    Positions are floats, which all programs read, or doubles where floats would blur the shape.
+    """
+    size, name = ("f8", "double") if np.any(far_middle(vertices)) else ("f4", "float")
+    channels = ("red", "green", "blue", "alpha")[: colors.shape[1]]
+    points = np.zeros(len(vertices), [("position", f"<{size}", 3), ("color", "u1", len(channels))])
+    points["position"], points["color"] = vertices, colors
+    triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    triangles["count"], triangles["corners"] = 3, faces
+    header = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
+        *(f"property {name} {axis}" for axis in "xyz"), *(f"property uchar {channel}" for channel in channels),
+        f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header\n",
+    ]  # fmt: skip
+    path.write_bytes("\n".join(header).encode("ascii") + points.tobytes() + triangles.tobytes())
 
 
 def write_obj(
@@ -39,7 +51,7 @@ def write_obj(
     """
     lines = [] if material is None else [f"mtllib {material}", "usemtl surface"]
     rows = vertices if colors is None else np.concatenate([vertices, colors], axis=1)
-    lines += ["v " + " ".join(f"{number:.9g}" for number in row) for row in rows.tolist()]
+    lines += ["v " + " ".join(f"{number:.12g}" for number in row) for row in rows.tolist()]
     if uv is None:
         lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     else:
@@ -62,13 +74,16 @@ def write_glb(
         colors: (V, 4) of unsigned bytes, as screens show them.
         normals: (V, 3), for smooth shading.
 
+    Positions of a shape far from the origin are relative to its middle, to where its node is moved.
+
     Source: glTF 2.0 specification, sections 3.7 (attributes) and 4.4 (the container).
     """
+    middle = far_middle(vertices)
     # glTF wants colours in proportion to light; those of screens are bent (IEC 61966-2-1).
     screen = colors[:, :3] / 255.0
     light = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
     parts = {
-        "POSITION": np.asarray(vertices, "<f4"),
+        "POSITION": np.asarray(vertices - middle, "<f4"),
         "COLOR_0": np.concatenate([light, colors[:, 3:] / 255.0], axis=1).astype("<f4"),
     }
     if normals is not None:
@@ -91,7 +106,7 @@ def write_glb(
         asset=dict(version="2.0", generator="ltljax"),
         scene=0,
         scenes=[dict(nodes=[0])],
-        nodes=[dict(mesh=0)],
+        nodes=[dict(mesh=0, **(dict(translation=middle.tolist()) if middle.any() else {}))],
         materials=[dict(pbrMetallicRoughness=paint, doubleSided=True)],
         meshes=[dict(primitives=[primitive])],
         accessors=accessors,

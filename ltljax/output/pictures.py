@@ -42,7 +42,7 @@ class Picture:
     ):
         import pyvista
 
-        self._surface: Any = pyvista.PolyData.from_regular_faces(vertices, faces)
+        self._surface: Any = pyvista.PolyData.from_regular_faces(vertices - vertices.mean(axis=0), faces)
         count = len(vertices)
         self._surface[title] = np.zeros((count, 3), np.uint8) if limits is None else np.full(count, limits[0])
         self._title = title

@@ -79,9 +79,9 @@ def smooth(
     else:
         how = dict(strength=0.35 if strength is None else strength, steps=5 if steps is None else steps)
         moved = imaging.denoise_mesh(surface, how["strength"], normal_iterations=how["steps"])
-    after = np.asarray(moved)
+    after = np.asarray(moved, np.float64) + surface.centre
     bends = [np.asarray(curvature_of(at).mean) for at in (surface, surface.with_vertices(moved))]
-    way = np.linalg.norm(after - np.asarray(surface.vertices), axis=1)
+    way = np.linalg.norm(np.asarray(moved - surface.vertices), axis=1)
     results.numbers({"mean_before": bends[0], "mean_after": bends[1], "way": way}, after)
     kind = subject.path.suffix.lower() if subject.path else ".ply"
     own = read_colors(subject.path) if subject.path else None

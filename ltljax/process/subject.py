@@ -4,7 +4,6 @@ What enters: names of files. What leaves: a `Subject`, and values in the order o
 """
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,8 @@ import numpy as np
 
 from ..lifting.schemes import Monotone
 from ..mesh import Mesh, load_mesh, shapes
-from ..surface import Surface
+from ..progress import noted
+from ..surface import FarFromOriginWarning, Surface
 
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000
@@ -103,9 +103,6 @@ def load(name: str, repair: bool) -> Subject:
     }
     path = None if name in built_in else Path(name)
     mesh = built_in[name]() if path is None else load_mesh(path, repair=repair).reordered()
-    with warnings.catch_warnings(record=True) as cautions:
-        warnings.simplefilter("always")
+    with noted(FarFromOriginWarning):
         surface = Surface.from_mesh(mesh, Monotone(), "float64", progress=mesh.num_vertices > _LONG_BUILD)
-    for caution in cautions:
-        print(f"note: {caution.message}")
     return Subject(name if path is None else path.name, path, mesh, surface, mesh.mesh_size)

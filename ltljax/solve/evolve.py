@@ -336,7 +336,7 @@ def solve(
         if dense or any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, t1, times))):
             raise ValueError("A run that is kept on disk cannot be traced by a JAX transformation, nor be dense.")
         run = dict(
-            mesh=fingerprint((surface.vertices, surface.faces, repr(surface.scheme))),
+            mesh=fingerprint((surface.vertices, surface.centre, surface.faces, repr(surface.scheme))),
             equation=fingerprint(equation),
             start=fingerprint((u0, float(t0))),  # type: ignore
             end=fingerprint((float(t1), times, dt, checkpoint_every)),  # type: ignore

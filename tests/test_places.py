@@ -1,0 +1,112 @@
+"""A change of place changes nothing: positions keep their digits wherever the mesh lies."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ltljax as ltl
+
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.FarFromOriginWarning")
+
+MAP = np.array([4e5, 5e6, 300.0])
+PLACES = st.tuples(*[st.floats(-7, 7).map(lambda power: np.sign(power) * 10 ** abs(power))] * 3).map(np.array)
+
+
+SPHERE = ltl.shapes.icosphere(3)
+
+
+def surface_at(place, size=1.0, dtype=jnp.float32, scheme=None):
+    mesh = ltl.Mesh(SPHERE.vertices * size + np.asarray(place), SPHERE.faces)
+    return ltl.Surface.from_mesh(mesh, scheme, dtype=dtype)
+
+
+@pytest.mark.parametrize("radius", [1.0, 50.0])
+def test_float32_at_map_coordinates_is_as_right_as_at_the_origin(radius):
+    here, there = surface_at(np.zeros(3), radius), surface_at(MAP, radius)
+    np.testing.assert_allclose(there.centre, MAP, rtol=1e-12)
+    angles = np.arccos(np.clip(SPHERE.vertices @ SPHERE.vertices[0], -1, 1))
+    errors = []
+    for surface in (here, there):
+        bent = np.abs(ltl.curvature(surface).mean * radius - 1)
+        normal = jnp.abs(ltl.laplacian(surface, surface.vertices) * radius + 2 * surface.normals)
+        far = jnp.abs(ltl.geodesic_distance(surface, 0) / radius - angles)
+        errors.append([float(np.max(x)) for x in (bent, normal, far)])
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0.05, atol=1e-3)
+    assert max(errors[1]) < 0.08
+
+
+@pytest.mark.parametrize(
+    "scheme", [ltl.Monotone(), ltl.Monotone(lift="chord"), ltl.Polynomial(), ltl.Paper()], ids=repr
+)
+@settings(max_examples=4, deadline=None)
+@given(place=PLACES)
+def test_a_place_changes_no_number(scheme, place):
+    here, there = surface_at(np.zeros(3), scheme=scheme), surface_at(place, scheme=scheme)
+    u = jnp.asarray(np.sin(3 * np.asarray(here.vertices[:, 0])))
+    bending = [] if isinstance(scheme, ltl.Paper) else [lambda s: ltl.curvature(s).mean]
+    for function in (
+        *bending,
+        lambda s: ltl.laplacian(s, u),
+        lambda s: ltl.gradient(s, u),
+        lambda s: ltl.geodesic_distance(s, 0),
+        lambda s: ltl.laplacian(s, s.vertices),
+        lambda s: ltl.integrate(s, u**2),
+        lambda s: s.mesh_size,
+    ):
+        exact, found = np.asarray(function(here)), np.asarray(function(there))
+        # Within two sizes from the origin positions are the mesh's own, with some digits fewer.
+        assert np.max(np.abs(found - exact)) <= 5e-3 * np.max(np.abs(exact))
+
+
+def test_positions_of_a_far_mesh_are_relative_to_its_centre():
+    with pytest.warns(ltl.FarFromOriginWarning, match=r"surface\.centre, \(400000, 5e\+06, 300\)"):
+        surface = surface_at(MAP)
+    np.testing.assert_allclose(surface.vertices, SPHERE.vertices, atol=1e-6)
+    # What is given or returned has the same centre; a mesh lies where the first one did.
+    moved = surface.with_vertices(2 * surface.vertices)
+    np.testing.assert_allclose(moved.vertex_areas, 4 * surface.vertex_areas, rtol=1e-4)
+    relief = ltl.displaced(surface, surface.vertices[:, 0], 0.1)
+    np.testing.assert_allclose(relief.vertices.mean(axis=0), MAP, atol=0.1)
+    flow = ltl.imaging.mean_curvature_flow(surface, 0.1)
+    np.testing.assert_allclose(jnp.linalg.norm(flow, axis=1), np.sqrt(1 - 0.4), atol=0.02)
+
+
+def test_positions_that_are_not_relative_to_the_centre_are_refused():
+    surface = surface_at(MAP)
+    with pytest.raises(ValueError, match=r"relative to surface\.centre"):
+        surface.with_vertices(SPHERE.vertices + MAP)
+
+
+def test_a_mesh_near_the_origin_keeps_its_positions():
+    surface = surface_at([5.0, 0, 0])
+    assert not surface.centre.any()
+    np.testing.assert_allclose(surface.vertices, SPHERE.vertices + np.array([5.0, 0, 0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "glb"])
+def test_files_of_a_far_mesh_keep_its_shape(tmp_path, kind):
+    from ltljax.output import files
+
+    path, far, grey = tmp_path / f"far.{kind}", SPHERE.vertices + MAP, np.full((SPHERE.num_vertices, 4), 200, np.uint8)
+    if kind == "obj":
+        files.write_obj(path, far, SPHERE.faces)
+    elif kind == "ply":
+        files.write_ply(path, far, SPHERE.faces, grey)
+    else:
+        files.write_glb(path, far, SPHERE.faces, grey)
+    np.testing.assert_allclose(ltl.load_mesh(path).vertices - MAP, SPHERE.vertices, atol=1e-5)
+
+
+def test_smoothing_a_file_at_map_coordinates_leaves_it_where_it_lies(tmp_path, capsys):
+    from ltljax.cli import main
+    from ltljax.output import files
+
+    path, out = tmp_path / "far.ply", tmp_path / "out"
+    files.write_ply(path, SPHERE.vertices + MAP, SPHERE.faces, np.full((SPHERE.num_vertices, 3), 200, np.uint8))
+    assert main(["smooth", str(path), "--method", "fair", "--out", str(out)]) == 0
+    assert "surface.centre" not in capsys.readouterr().out
+    radii = np.linalg.norm(ltl.load_mesh(out / "smooth.ply").vertices - MAP, axis=1)
+    assert 0.9 < radii.min() <= radii.max() < 1
+    assert np.ptp(radii) < 1e-3
