@@ -16,8 +16,9 @@ from .lifting import support
 from .lifting.intrinsic import CotangentRows, Paths, cotangent_weights, with_columns
 from .lifting.jets import operator_weights
 from .lifting.layout import PerBlock, Places, block_paths, rows_last
-from .lifting.schemes import Topology, places
+from .lifting.schemes import Geometry, Topology, conormals_in_frame, flux_weights, places
 from .mesh import one_rings
+from .operators import gradient
 from .progress import watched
 from .surface import Surface
 from .tables import (
@@ -47,6 +48,7 @@ class EllipticStencil(eqx.Module):
         weights: one array (K, N) per block of the table, non-negative.
         reverse: the same weights in the order of the table's reverse, for derivatives in reverse mode.
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
+        flux_weights: (B, 2) what a unit flux through each side of a boundary vertex adds to the operator there.
         mean_diffusion: half the trace of D in the tangent plane, its mean over the vertices.
     """
 
@@ -56,6 +58,7 @@ class EllipticStencil(eqx.Module):
     weights: PerBlock
     reverse: ReverseWeights | None
     residual: Float[AnyArray, " V"]
+    flux_weights: Float[AnyArray, "B 2"]
     mean_diffusion: Float[AnyArray, ""]
 
     def __call__(self, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
@@ -76,18 +79,27 @@ class EllipticStencil(eqx.Module):
         return jnp.mean(slot_sum(self.table, self.weights)) / 2
 
     def with_coefficients(
-        self, surface: Surface, diffusion: AnyArray | float, drift: AnyArray | None = None
+        self,
+        surface: Surface,
+        diffusion: AnyArray | float,
+        drift: AnyArray | None = None,
+        divergence_form: bool = False,
     ) -> "EllipticStencil":
         """The stencil of other coefficients, or of a moved surface, on the same neighbours: pure and differentiable.
 
         As good as the neighbours suit the new coefficients; ``residual`` tells.
         """
+        if divergence_form:
+            drift = _with_divergence(surface, diffusion, drift)
         targets = _targets(surface.geometry.frames, diffusion, drift)
         around = places(surface.scheme, surface.topology, surface.geometry)
-        weights, residual = _rows(around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows)
-        found = (weights, reverse_weights(self.table, weights), residual, _mean_diffusion(targets))
-        weights, reverse, residual, mean = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, self.paths, self.cotangent_rows, weights, reverse, residual, mean)
+        weights, residual, left = _rows(
+            around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows
+        )
+        flux = _flux_weights(surface.topology, surface.geometry, targets, left, self.table, self.cotangent_rows)
+        found = (weights, reverse_weights(self.table, weights), residual, flux, _mean_diffusion(targets))
+        found = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
+        return EllipticStencil(self.table, self.paths, self.cotangent_rows, *found)
 
 
 def elliptic_stencil(
@@ -95,26 +107,29 @@ def elliptic_stencil(
     diffusion: Float[AnyArray, "..."] | float,
     drift: Float[AnyArray, "V 3"] | None = None,
     progress: bool = False,
+    divergence_form: bool = False,
 ) -> EllipticStencil:
-    """Non-negative weights for the operator D : Hess u + b . grad u (host).
+    """Non-negative weights for the operator D : Hess u + b . grad u, or div(D grad u) + b . grad u (host).
 
     Each row is the one-ring's where its weights are non-negative, else what non-negative least squares picks from two
     and three rings. Pointwise first order, like the Laplacian. Where drift dominates (|b| h > 2 D) no non-negative row
     meets both; then the drift is met and as little diffusion as possible is added, of the order |b| h: the row is
     upwind. Where D is so anisotropic that three rings hold no consistent row, the row of least error is taken. Both
     show in the residual. Such an operator has a maximum principle and no growing modes. On a boundary it is for fields
-    whose normal derivative vanishes.
+    whose normal derivative vanishes; equations add the fluxes of `Neumann` and `Robin` conditions.
 
     Where the Laplacian has a cotangent row (see `SurfaceReport`), so has an isotropic operator without drift: D times
     that row. Other operators have no row of that kind, and where none is consistent the residual says so.
 
-    For the divergence form div(D grad u) add the divergence of D to the drift; for a scalar D see `weighted_laplacian`.
+    The divergence form div(D grad u) is D : Hess u + (div D) . grad u: the divergence of D, by the surface's gradient,
+    is added to the drift. It is for a D that is smooth; a scalar D that jumps is for `weighted_laplacian`.
 
     Args:
         surface: the surface.
         diffusion: D, a number, (V,), or symmetric non-negative tensors (V, 3, 3), of which the tangent part counts.
         drift: b, (V, 3), of which the tangent part counts.
         progress: whether to show how far the choice of neighbours is.
+        divergence_form: whether the operator is div(D grad u) + b . grad u.
 
     Raises:
         ValueError: D is not symmetric or not non-negative, a shape does not fit, or the surface is being traced.
@@ -126,6 +141,8 @@ def elliptic_stencil(
         )
     topology, geometry = jax.tree.map(_on_host, (surface.topology, surface.geometry))
     around, kinds = places(surface.scheme, topology, geometry), topology.kinds
+    if divergence_form:
+        drift = _with_divergence(surface, diffusion, drift)
     drift = None if drift is None else np.asarray(drift, np.float64)
     targets = _targets(geometry.frames, _checked(diffusion, geometry.frames), drift)
     reach = reach_along(
@@ -135,7 +152,7 @@ def elliptic_stencil(
         topology.is_extrinsic,
     )
     rows = support.Rows.all_of(reach(np.arange(surface.num_vertices), 1))
-    _, residual = _rows(around, kinds, targets, *_table(rows, topology, around), None)
+    _, residual, _ = _rows(around, kinds, targets, *_table(rows, topology, around), None)
     # Where the Laplacian has a cotangent row, so has an isotropic operator without drift.
     is_cotangent = _is_isotropic(targets) & _cotangent_vertices(topology)
     # Where some row meets every condition there is nothing to emphasise.
@@ -153,11 +170,12 @@ def elliptic_stencil(
     rows, cotangent_rows = _with_cotangent_rows(rows, topology, is_cotangent)
     table, paths = _table(rows, topology, around)
     table = reversible(table)
-    weights, residual = _rows(around, kinds, targets, table, paths, cotangent_rows)
-    found = (weights, reverse_weights(table, weights), residual, _mean_diffusion(targets))
-    weights, reverse, residual, mean = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
+    weights, residual, left = _rows(around, kinds, targets, table, paths, cotangent_rows)
+    flux = _flux_weights(topology, geometry, targets, left, table, cotangent_rows)
+    found = (weights, reverse_weights(table, weights), residual, flux, _mean_diffusion(targets))
+    found = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
     table, paths, cotangent_rows = jax.tree.map(jnp.asarray, (table, paths, cotangent_rows))
-    return EllipticStencil(table, paths, cotangent_rows, weights, reverse, residual, mean)
+    return EllipticStencil(table, paths, cotangent_rows, *found)
 
 
 def direction_tensor(
@@ -182,6 +200,20 @@ def direction_tensor(
     onto = jnp.where(has_none, plane / 2, tangent[:, :, None] * tangent[:, None, :] / jnp.where(has_none, 1, squared))
     along, across = (jnp.asarray(value, normals.dtype).reshape(-1, 1, 1) for value in (along, across))
     return across * plane + (along - across) * onto
+
+
+def _with_divergence(surface: Surface, diffusion: AnyArray | float, drift: AnyArray | None) -> Float[Array, "V 3"]:
+    """The drift with the divergence of a diffusion, a number, (V,) or (V, 3, 3), added to it."""
+    coefficient, normals = jnp.asarray(diffusion, surface.dtype), surface.normals
+    if coefficient.ndim < 3:
+        own = gradient(surface, jnp.broadcast_to(coefficient, (surface.num_vertices,)))
+    else:
+        # In ambient coordinates, of the tangent part of the tensor. The normal part of the sum does not count.
+        onto = jnp.eye(3, dtype=normals.dtype)[None] - normals[:, :, None] * normals[:, None, :]
+        tensor = onto @ coefficient @ onto
+        changes = gradient(surface, tensor.reshape(-1, 9)).reshape(-1, 3, 3, 3)
+        own = jnp.einsum("viji->vj", changes)
+    return own if drift is None else own + jnp.asarray(drift, surface.dtype)
 
 
 @eqx.filter_jit
@@ -253,18 +285,21 @@ def _rows(
     table: Table,
     paths: tuple[Paths, ...] | None,
     cotangent_rows: tuple[CotangentRows, ...] | None,
-) -> tuple[PerBlock, AnyArray]:
-    """The weights on the neighbours, and the residual of every row."""
+) -> tuple[PerBlock, AnyArray, AnyArray]:
+    """The weights on the neighbours, the residual of every row, and its first moments (V, 2) beyond the drift."""
 
     def rows(block, lifted):
-        lifted = lifted.__array_namespace__().moveaxis(lifted, -1, 1)
+        xp = lifted.__array_namespace__()
+        lifted = xp.moveaxis(lifted, -1, 1)
         wanted = block.centre(targets[0].T).T[None]
         c, residual = operator_weights(lifted, block.centre(kinds), wanted, nonnegative=True, emphasis=_EMPHASIS)
-        return c[0], residual[0]
+        left = xp.einsum("kn,kna->an", c[0], lifted) - wanted[0, :2]
+        return c[0], residual[0], left
 
-    weights, residuals = zip(*table.each(rows, rows_last(around.lifted(table, paths))), strict=True)
+    weights, residuals, left = zip(*table.each(rows, rows_last(around.lifted(table, paths))), strict=True)
+    beyond = table.rows_from([part.T for part in left])
     if cotangent_rows is None or around.directions is None:
-        return weights, table.rows_from(list(residuals))
+        return weights, table.rows_from(list(residuals)), beyond
     blocks = []
     half_trace = (targets[0, 3] + targets[0, 4]) / 4
     for block, row, weight, residual in zip(table.blocks, cotangent_rows, weights, residuals, strict=True):
@@ -273,7 +308,31 @@ def _rows(
         exact = with_columns(residual[None], row.columns, 0 * area[None])[0]
         blocks.append((with_columns(weight, row.columns, scaled), exact))
     weights, residuals = zip(*blocks, strict=True)
-    return weights, table.rows_from(list(residuals))
+    return weights, table.rows_from(list(residuals)), beyond
+
+
+def _flux_weights(
+    topology: Topology,
+    geometry: Geometry,
+    targets: AnyArray,
+    left: AnyArray,
+    table: Table,
+    cotangent_rows: tuple[CotangentRows, ...] | None,
+) -> AnyArray:
+    """What unit fluxes through both sides of each boundary vertex add to the operator, (B, 2), from what rows leave of
+    the first moments; of a row that is a multiple of the Laplacian's, that multiple."""
+    conormals = conormals_in_frame(topology, geometry.frames, geometry.conormals, geometry.directions)
+    weights = flux_weights(left[topology.boundary], conormals)
+    if cotangent_rows is None or geometry.flux_weights is None:
+        return weights
+    xp = weights.__array_namespace__()
+    marks = [
+        with_columns(0 * block.centre(targets[0, 0])[None], rows.columns, 0 * rows.columns[None] + 1.0)[0]
+        for block, rows in zip(table.blocks, cotangent_rows, strict=True)
+    ]
+    is_cotangent = table.rows_from(marks)[topology.boundary] > 0
+    half_trace = ((targets[0, 3] + targets[0, 4]) / 4)[topology.boundary]
+    return xp.where(is_cotangent[:, None], half_trace[:, None] * geometry.flux_weights, weights)
 
 
 def _is_isotropic(targets: np.ndarray) -> np.ndarray:

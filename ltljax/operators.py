@@ -118,11 +118,18 @@ def through_sides(surface: Surface, flux: Float[Array, "V *C"], u: Float[AnyArra
     return jnp.einsum("b...c,bsc->sb...", here, surface.geometry.conormals)
 
 
-def add_flux(surface: Surface, rate: Float[Array, "V *S"], through: Float[Array, "2 B *S"]) -> Float[Array, "V *S"]:
-    """The Laplacian with what fluxes through the sides of boundary vertices add to it."""
-    if surface.geometry.flux_weights is None:
+def add_flux(
+    surface: Surface,
+    rate: Float[Array, "V *S"],
+    through: Float[Array, "2 B *S"],
+    weights: Float[Array, "B 2"] | None = None,
+) -> Float[Array, "V *S"]:
+    """The Laplacian, or another operator with flux weights of its own, with what fluxes through the sides of boundary
+    vertices add to it."""
+    weights = surface.geometry.flux_weights if weights is None else weights
+    if weights is None:
         raise ValueError("Paper() knows of no flux through a boundary. Use ltl.Monotone() or ltl.Polynomial().")
-    added = jnp.einsum("sb...,bs->b...", through, surface.geometry.flux_weights)
+    added = jnp.einsum("sb...,bs->b...", through, weights)
     return rate.at[surface.topology.boundary].add(added, unique_indices=True)
 
 

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "operators": {"surface", "tables"},
     "curvature": {"surface", "construction", "lifting", "operators", "tables"},
     "vectors": {"surface", "lifting", "operators", "curvature", "tables"},
-    "elliptic": {"surface", "construction", "lifting", "mesh", "tables", "progress"},
+    "elliptic": {"surface", "construction", "lifting", "mesh", "operators", "tables", "progress"},
     "formulas": set(),
     "equations": {"elliptic", "operators", "surface", "tables", "vectors"},
     "solve": {

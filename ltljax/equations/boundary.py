@@ -19,8 +19,16 @@ from ..surface import Surface
 # None for the whole boundary, the number of a boundary loop (as in mesh.boundary_loops), a mask (V,), or a predicate
 # ``vertices (V, 3) -> (V,)``.
 Where = None | int | Bool[Array, " V"] | Callable[[Float[Array, "V 3"]], Bool[Array, " V"]]
+# None for all species of a state (V, S), the number of one, or several of them.
+Species = None | int | tuple[int, ...]
 # A number, an array that fits the state, or a function ``(t, vertices) -> array``.
 Data = Any
+
+
+def _species(given: Species) -> Species:
+    if given is None or isinstance(given, int):
+        return given
+    return tuple(int(species) for species in given)
 
 
 class Neumann(eqx.Module):
@@ -31,10 +39,12 @@ class Neumann(eqx.Module):
             part along the conormal is meant, (V, 3) or (V, S, 3), which serves both sides of a corner.
         where: None for the whole boundary, the number of a loop in ``mesh.boundary_loops``, a mask (V,), or a predicate
             ``vertices (V, 3) -> (V,)``.
+        species: of a state (V, S) the number of the species that is meant, or several; None for all.
     """
 
     flux: Data = 0.0
     where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
 
 
 class Dirichlet(eqx.Module):
@@ -43,10 +53,12 @@ class Dirichlet(eqx.Module):
     Attributes:
         value: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these.
         where: as of `Neumann`.
+        species: as of `Neumann`.
     """
 
     value: Data = 0.0
     where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
 
 
 class Robin(eqx.Module):
@@ -57,12 +69,14 @@ class Robin(eqx.Module):
         b: as the values of `Dirichlet`; not zero.
         g: as the values of `Dirichlet`.
         where: as of `Neumann`.
+        species: as of `Neumann`.
     """
 
     a: Data = 1.0
     b: Data = 1.0
     g: Data = 0.0
     where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
 
 
 Condition = Neumann | Dirichlet | Robin
@@ -84,10 +98,17 @@ def bounded_laplacian(
     surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "V *S"]:
     """The Laplacian of a state that keeps the conditions, with the fluxes they let through."""
-    rate = laplacian(surface, u)
+    rate, flux = laplacian(surface, u), fluxes(surface, conditions, t, u)
+    return rate if flux is None else add_flux(surface, rate, flux)
+
+
+def fluxes(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "2 B *S"] | None:
+    """The normal derivatives of a state at both sides of the boundary vertices; None where none are prescribed."""
     conditions = as_tuple(conditions)
     if not any(isinstance(condition, Neumann | Robin) for condition in conditions):
-        return rate
+        return None
     boundary = surface.topology.boundary
     through = jnp.zeros((2, boundary.shape[0], *u.shape[1:]), u.dtype)
     for condition in conditions:
@@ -98,9 +119,8 @@ def bounded_laplacian(
             flux = through_sides(surface, (g - a * u) / b, u)
         else:
             continue
-        here = _mask(condition.where, surface)[boundary].reshape(1, -1, *(1,) * (u.ndim - 1))
-        through = jnp.where(here, flux, through)
-    return add_flux(surface, rate, through)
+        through = jnp.where(_covered(condition, surface, u)[boundary][None], flux, through)
+    return through
 
 
 def held(
@@ -134,9 +154,15 @@ def released(surface: Surface, conditions: Conditions, rate: Float[Array, "V *S"
     return rate
 
 
+def held_values(surface: Surface, conditions: Conditions, u: Float[Array, "V *S"]) -> Bool[Array, "V *S"]:
+    """Which values of a state Dirichlet conditions hold."""
+    masks = [_covered(condition, surface, u) for condition in _dirichlet(conditions)]
+    return functools.reduce(jnp.logical_or, masks, jnp.zeros(u.shape, bool))
+
+
 def held_vertices(surface: Surface, conditions: Conditions) -> Bool[Array, " V"]:
-    """The vertices whose values Dirichlet conditions hold."""
-    masks = [_mask(condition.where, surface) for condition in _dirichlet(conditions)]
+    """The vertices at which Dirichlet conditions hold every species."""
+    masks = [_mask(condition.where, surface) for condition in _dirichlet(conditions) if condition.species is None]
     return functools.reduce(jnp.logical_or, masks, jnp.zeros(surface.num_vertices, bool))
 
 
@@ -145,9 +171,9 @@ def absorption(
 ) -> Float[Array, " V"]:
     """What Robin conditions take from -Delta u at each vertex, per unit of u; the mean over species."""
     linear = tuple(
-        Robin(condition.a, condition.b, 0.0, condition.where)
+        Robin(condition.a, condition.b, 0.0, condition.where, condition.species)
         if isinstance(condition, Robin)
-        else Neumann(0.0, condition.where)
+        else Neumann(0.0, condition.where, condition.species)
         for condition in as_tuple(conditions)
         if not isinstance(condition, Dirichlet)
     )
@@ -156,15 +182,20 @@ def absorption(
 
 
 def stiffness(
-    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+    surface: Surface,
+    conditions: Conditions,
+    t: Float[Array, ""],
+    u: Float[Array, "V *S"],
+    weights: Float[Array, "B 2"] | None = None,
 ) -> Float[Array, ""]:
-    """A bound of what Robin conditions add to the eigenvalues of the Laplacian."""
+    """A bound of what Robin conditions add to the eigenvalues of the Laplacian, or of an operator with flux weights of
+    its own."""
     bound = jnp.zeros((), u.dtype)
     for condition in as_tuple(conditions):
         if isinstance(condition, Robin):
             ratio = _data(condition.a, t, surface, u) / _data(condition.b, t, surface, u)
-            ratio = jnp.where(_mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1)), ratio, 0)
-            added = add_flux(surface, jnp.zeros_like(u), through_sides(surface, jnp.abs(ratio), u))
+            ratio = jnp.where(_covered(condition, surface, u), ratio, 0)
+            added = add_flux(surface, jnp.zeros_like(u), through_sides(surface, jnp.abs(ratio), u), weights)
             bound = jnp.maximum(bound, jnp.max(jnp.abs(added)))
     return bound
 
@@ -174,7 +205,22 @@ def _dirichlet(conditions: Conditions) -> list[Dirichlet]:
 
 
 def _where(condition: Condition, surface: Surface, inside: Array, outside: Array) -> Array:
-    return jnp.where(_mask(condition.where, surface).reshape(-1, *(1,) * (outside.ndim - 1)), inside, outside)
+    return jnp.where(_covered(condition, surface, outside), inside, outside)
+
+
+def _covered(condition: Condition, surface: Surface, u: Array) -> Bool[Array, "V *#S"]:
+    """Which values of a state a condition is for."""
+    mask = _mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1))
+    if condition.species is None:
+        return mask
+    if u.ndim != 2:
+        raise ValueError(
+            f"A condition for species {condition.species} needs a state of several species, (V, S), found {u.shape}."
+        )
+    chosen = (condition.species,) if isinstance(condition.species, int) else condition.species
+    if not all(0 <= species < u.shape[1] for species in chosen):
+        raise ValueError(f"Expected species from 0 to {u.shape[1] - 1}, found {condition.species} in a condition.")
+    return mask & jnp.asarray([species in chosen for species in range(u.shape[1])])[None]
 
 
 def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:

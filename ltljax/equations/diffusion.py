@@ -1,4 +1,4 @@
-"""Linear diffusion with a source."""
+"""Linear diffusion with a source, of one field or of several species that do not meet."""
 
 from collections.abc import Callable
 
@@ -6,27 +6,31 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..operators import spectral_bound
 from ..surface import Surface
 from . import boundary as bounds
 from .boundary import Conditions
 from .equation import Equation
+from .spreads import Spreads, as_spreads, mean_diffusivities, spread_bound, spread_rate, spread_width
 
 Source = Float[Array, "V *S"] | Callable[[Float[Array, ""], Float[Array, "V 3"]], Float[Array, "V *S"]]
 
 
 class Diffusion(Equation):
-    """u_t = D Delta u + g on a surface.
+    """u_t = D Delta u + g, or div(D grad u) + g where D varies, on a surface.
 
     Attributes:
-        diffusivity: D, a positive number; for a state (V, S) also one number for each species, (S,).
+        diffusivity: D, a positive number; a field (V,) for div(D grad u), which may jump, and through a zero of which
+            nothing flows (`weighted_laplacian` with the harmonic mean); or an `EllipticStencil`, such as diffusion
+            along a direction field or drift with a flow. For a state (V, S) also one number for each species, (S,), or
+            a tuple with any of these for each.
         source: g: None, an array like the state, or a function ``(t, vertices) -> array``.
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivative vanishes.
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several, for all species or some; without any the normal
+            derivative vanishes.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 3.
     """
 
-    diffusivity: Float[Array, "*S"] | float = 1.0
+    diffusivity: Spreads = eqx.field(default=1.0, converter=as_spreads)
     source: Source | None = None
     boundary: Conditions = eqx.field(default=(), converter=bounds.as_tuple)
 
@@ -37,8 +41,8 @@ class Diffusion(Equation):
     def implicit_rate(self, t, surface: Surface, u):
         """D Delta u with the fluxes through the boundary; of a value that is held, that value's rate."""
         u = self.held(t, surface, u)
-        diffused = bounds.bounded_laplacian(surface, self.boundary, t, u)
-        return bounds.held_rate(surface, self.boundary, t, u, self.diffusivities(u)[None] * diffused)
+        spread = spread_rate(surface, self.diffusivity, self.boundary, t, u)
+        return bounds.held_rate(surface, self.boundary, t, u, spread)
 
     def explicit_rate(self, t, surface: Surface, u):
         """The source g; zero where a value is held."""
@@ -51,8 +55,8 @@ class Diffusion(Equation):
         return bounds.released(surface, self.boundary, source)
 
     def diffusivities(self, u):
-        """D for every species."""
-        return jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
+        """D for every species; of what varies, the mean."""
+        return mean_diffusivities(self.diffusivity, u)
 
     @property
     def is_affine(self) -> bool:
@@ -69,6 +73,10 @@ class Diffusion(Equation):
         return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The largest diffusivity times the bound of the Laplacian's eigenvalues."""
-        bound = spectral_bound(surface) + bounds.stiffness(surface, self.boundary, t, u)
-        return jnp.max(jnp.abs(self.diffusivities(u))) * bound
+        """The largest diffusivity times the bound of the Laplacian's eigenvalues, or the largest of the operators'."""
+        return spread_bound(surface, self.diffusivity, self.boundary, t, u)
+
+    def spectral_width(self, t, surface: Surface, u):
+        """The largest diffusivity times the Laplacian's width, or the largest of the operators'."""
+        del t
+        return spread_width(surface, self.diffusivity, u)

@@ -7,19 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..elliptic import EllipticStencil
-from ..operators import spectral_bound, spectral_width, weighted_laplacian
 from ..surface import Surface
 from . import boundary as bounds
-from .boundary import Conditions, Neumann, Robin
+from .boundary import Conditions
 from .equation import Equation
 from .kinetics import Kinetics
+from .spreads import Spread, as_spreads, mean_diffusivities, spread_bound, spread_rate, spread_width
 
 # A spectral radius is estimated from a power whose exponent is two to this one.
 _SQUARINGS = 5
-
-# How one species spreads: a number, a field over the surface, or an operator of its own.
-Spread = Float[Array, ""] | Float[Array, " V"] | EllipticStencil
 
 
 class ReactionDiffusion(Equation):
@@ -36,8 +32,8 @@ class ReactionDiffusion(Equation):
             over the vertices: what is written in arithmetic holds at every one of them. A function of a single point,
             such as a neural network, goes through `jax.vmap`.
         params: the parameters of a plain function; a pytree of scalars, or of fields (V,) over the surface.
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivatives vanish. Fluxes
-            need numbers as diffusivities.
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several, for all species or some; without any the normal
+            derivatives vanish.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 4; Turing (1952), doi:10.1098/rstb.1952.0012.
     """
@@ -53,18 +49,9 @@ class ReactionDiffusion(Equation):
         params: Any = None,
         boundary: Conditions | None = None,
     ):
-        spreads = tuple(
-            d if isinstance(d, EllipticStencil) else jnp.asarray(d, jnp.result_type(float)) for d in diffusivity
-        )
-        are_numbers = all(not isinstance(d, EllipticStencil) and d.ndim == 0 for d in spreads)
-        self.diffusivity = jnp.stack(cast(list[Array], spreads)) if are_numbers else spreads
+        self.diffusivity = cast(Array | tuple[Spread, ...], as_spreads(tuple(diffusivity)))
         self.reaction = reaction if isinstance(reaction, Kinetics) else Kinetics(reaction, params)
         self.boundary = bounds.as_tuple(boundary)
-        if not are_numbers and any(isinstance(condition, Neumann | Robin) for condition in self.boundary):
-            raise ValueError(
-                "Neumann and Robin conditions need a number as the diffusivity of every species. Leave them out for "
-                "vanishing normal derivatives, or hold values with ltl.Dirichlet."
-            )
 
     @property
     def num_species(self) -> int:
@@ -79,11 +66,7 @@ class ReactionDiffusion(Equation):
         """The diffusion of every species; of a value that is held, that value's rate."""
         self._check(u)
         u = self.held(t, surface, u)
-        if isinstance(self.diffusivity, tuple):
-            columns = [_spread(surface, spread, u[:, s]) for s, spread in enumerate(self.diffusivity)]
-            spread = jnp.stack(columns, axis=1)
-        else:
-            spread = self.diffusivities(u)[None] * bounds.bounded_laplacian(surface, self.boundary, t, u)
+        spread = spread_rate(surface, self.diffusivity, self.boundary, t, u)
         return bounds.held_rate(surface, self.boundary, t, u, spread)
 
     def explicit_rate(self, t, surface: Surface, u):
@@ -92,10 +75,7 @@ class ReactionDiffusion(Equation):
 
     def diffusivities(self, u):
         """One number for each species; of what varies, the mean."""
-        if not isinstance(self.diffusivity, tuple):
-            return self.diffusivity.astype(u.dtype)
-        means = [d.mean_diffusion if isinstance(d, EllipticStencil) else jnp.mean(d) for d in self.diffusivity]
-        return jnp.stack([mean.astype(u.dtype) for mean in means])
+        return mean_diffusivities(self.diffusivity, u)
 
     @property
     def conditions(self):
@@ -111,28 +91,19 @@ class ReactionDiffusion(Equation):
         the species."""
         self._check(u)
         reaction = jnp.max(_spectral_radius(jnp.abs(self._jacobian(u))))
-        bound = spectral_bound(surface) + bounds.stiffness(surface, self.boundary, t, u)
-        fastest = [
-            d.spectral_bound() if isinstance(d, EllipticStencil) else jnp.max(d.astype(u.dtype)) * bound
-            for d in self.diffusivity
-        ]
-        return jnp.max(jnp.stack(fastest)) + reaction
+        return spread_bound(surface, self.diffusivity, self.boundary, t, u) + reaction
 
     def spectral_width(self, t, surface: Surface, u):
         """The diffusion's width plus twice the largest frequency at which the reaction turns a state about another."""
         del t
         self._check(u)
-        jacobian, width = self._jacobian(u), spectral_width(surface).astype(u.dtype)
+        jacobian = self._jacobian(u)
         # Two species turn about one another at this frequency at most. More of them also turn in longer cycles, whose
         # frequency is at most the spectral radius of what is off the diagonal.
         turning = jnp.sqrt(jnp.maximum(-jacobian * jnp.swapaxes(jacobian, 1, 2), 0))
         if u.shape[1] > 2:
             turning = jnp.abs(jacobian) * (1 - jnp.eye(u.shape[1], dtype=u.dtype))
-        widest = [
-            d.spectral_width() if isinstance(d, EllipticStencil) else jnp.max(d.astype(u.dtype)) * width
-            for d in self.diffusivity
-        ]
-        return jnp.max(jnp.stack(widest)) + 2 * jnp.max(_spectral_radius(turning))
+        return spread_width(surface, self.diffusivity, u) + 2 * jnp.max(_spectral_radius(turning))
 
     def _jacobian(self, u: Array) -> Array:
         """The derivatives of the reaction's rates at every vertex, (V, S, S)."""
@@ -163,11 +134,3 @@ def _spectral_radius(a: Float[Array, "V S S"]) -> Float[Array, " V"]:
         a, logarithm = a / norm[:, None, None], logarithm + jnp.log(norm)
         a, logarithm = jnp.einsum("vij,vjk->vik", a, a), 2 * logarithm
     return jnp.exp(logarithm / 2 ** (_SQUARINGS + 1))
-
-
-def _spread(surface: Surface, spread: Spread, u: Float[Array, " V"]) -> Float[Array, " V"]:
-    """What the diffusion of one species makes of it."""
-    if isinstance(spread, EllipticStencil):
-        return spread(u)
-    conductivity = jnp.broadcast_to(spread.astype(u.dtype), u.shape)
-    return weighted_laplacian(surface, conductivity, u, "harmonic")

@@ -308,7 +308,7 @@ def weigh_in_frames(
     if not isinstance(scheme, Paper) and topology.diffusion is not None:
         laplacian, residual, first, areas = diffusion_rows(scheme, laying, topology)
         backwards = reverse_weights(topology.diffusion, laplacian)
-        flux = _flux_weights(first[topology.boundary], _conormals_in_frame(topology, frames, conormals, directions))
+        flux = flux_weights(first[topology.boundary], conormals_in_frame(topology, frames, conormals, directions))
         if areas is not None:
             # A cotangent row takes half of each side's flux.
             area = areas[topology.boundary][:, None]
@@ -409,7 +409,12 @@ def _with_cotangent_rows(
     return replaced, exact, areas
 
 
-def _conormals_in_frame(topology: Topology, frames, conormals, directions: Directions | None):
+def conormals_in_frame(
+    topology: Topology,
+    frames: Float[AnyArray, "V 2 3"],
+    conormals: Float[AnyArray, "B 2 3"],
+    directions: Directions | None,
+) -> Float[AnyArray, "B 2 2"]:
     """The conormals (B, 2, 2) of both sides of each boundary vertex, in the coordinates of its row."""
     xp = frames.__array_namespace__()
     in_space = xp.einsum("bsc,bac->bsa", conormals, frames[topology.boundary])
@@ -433,9 +438,9 @@ def _side_lengths(vertices, topology: Topology):
     return xp.sqrt(xp.sum(both**2, axis=-1))
 
 
-def _flux_weights(first, conormals):
-    """The weights (B, 2) of the fluxes through both sides, from the first moments (B, 2) of the Laplacian rows and the
-    conormals (B, 2, 2) of the sides in the frame.
+def flux_weights(first: Float[AnyArray, "B 2"], conormals: Float[AnyArray, "B 2 2"]) -> Float[AnyArray, "B 2"]:
+    """The weights (B, 2) of the fluxes through both sides, from what the rows leave of the first moments (B, 2) and
+    the conormals (B, 2, 2) of the sides in the frame.
 
     The rows leave ``-first . grad u`` over. On a smooth boundary the gradient's part along it has no weight; at a
     corner the gradient g solves conormal . g = flux for both sides.

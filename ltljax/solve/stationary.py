@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from ..equations import Diffusion, Equation
 from ..equations import boundary as bounds
+from ..equations.spreads import are_numbers
 from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..operators import spectral_bound
 from ..surface import Surface
@@ -120,6 +121,11 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
             f"Expected a screening that is a number or of shape {f.shape[:1]}, found {jnp.shape(screening)}."
         )
     equation = Diffusion(1.0, source=-f, boundary=() if boundary is None else boundary)
+    if not _is_plain(equation, f):
+        raise ValueError(
+            "A condition for some species only belongs to a state of several species. The columns of a right side are "
+            "systems of their own: solve for each of them by itself."
+        )
     preconditioner = _inverse(equation, surface, f, screening) if preconditioner is None else preconditioner
     tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
     screening = jnp.broadcast_to(jnp.asarray(screening, f.dtype), f.shape[:1])
@@ -137,6 +143,12 @@ def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
         if throw and not bool(converged):
             raise SolveError(_unconverged(int(steps), preconditioner))
     return u
+
+
+def _is_plain(equation: Diffusion, u: Array) -> bool:
+    """Whether diffusion is a multiple of the Laplacian for every species, with the same conditions for all."""
+    same = all(condition.species is None for condition in equation.conditions)
+    return same and are_numbers(equation.diffusivity, u)
 
 
 def _inverse(equation: Diffusion, surface: Surface, f: Array, screening: Any) -> Multigrid | Factorized | None:
@@ -261,9 +273,9 @@ def steady_state(
 ) -> Float[Array, "V *S"]:
     """A state at which the rate of an equation vanishes.
 
-    `Diffusion` is one linear system, solved to rounding whatever the tolerance; where it conserves mass (nothing holds
-    or absorbs), the state has the mass of u0.
-    Of a nonlinear equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
+    `Diffusion` with numbers as diffusivities, and conditions for all species, is one linear system, solved to rounding
+    whatever the tolerance; where it conserves mass (nothing holds or absorbs), the state has the mass of u0.
+    Of any other equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
     rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
     state is steady, then takes Newton's last step (for `Diffusion` the linear system). Differentiable in reverse and
     forward mode by the implicit function theorem, in everything but u0.
@@ -291,9 +303,10 @@ def steady_state(
     """
     u0 = checks.field(surface, u0, "u0")
     checks.finite(equation, u0)
-    if isinstance(preconditioner, Factorized) and not isinstance(equation, Diffusion):
+    is_one_system = isinstance(equation, Diffusion) and _is_plain(equation, u0)
+    if isinstance(preconditioner, Factorized) and not is_one_system:
         raise ValueError(
-            f"A factor is that of one linear system, but {type(equation).__name__} has many. Hand in "
+            f"A factor is that of one linear system, but this {type(equation).__name__} has many. Hand in "
             "ltl.multigrid(surface) as preconditioner."
         )
     if not tolerance > 0 or not t1 > 0:
@@ -309,7 +322,7 @@ def steady_state(
         numbers, rest = eqx.partition((equation, surface, u0), eqx.is_inexact_array)
         still, where, u0 = eqx.combine(jax.lax.stop_gradient(numbers), rest)
         u0 = solve(still, where, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
-    if isinstance(equation, Diffusion):
+    if isinstance(equation, Diffusion) and is_one_system:
         return _steady_diffusion(equation, surface, u0, first, time, preconditioner, throw)
     u, rate, wanted, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
     if throw and not isinstance(u, Tracer) and not float(rate) <= float(wanted):
@@ -365,7 +378,7 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
     stiffness = equation.spectral_bound(time, surface, u0)
     reaction = jnp.maximum(stiffness - jnp.max(flat) * spectral_bound(surface), 0)
 
-    is_held = bounds.held_vertices(surface, equation.conditions).reshape(-1, *(1,) * (u0.ndim - 1))
+    is_held = bounds.held_values(surface, equation.conditions, u0)
 
     def rate(u):
         # What is held returns to its value, which makes the system regular and lets derivatives see the data.
