@@ -11,7 +11,7 @@ equations are made of operators; `solve` carries them through time.
 from importlib.metadata import version as _version
 
 from . import imaging
-from .construction import InconsistentRowsWarning
+from .construction import CoarseMeshWarning, InconsistentRowsWarning
 from .curvature import Curvature, PolyhedralCurvature, curvature, polyhedral_curvature
 from .elliptic import EllipticStencil, direction_tensor, elliptic_stencil
 from .equations import (
@@ -128,6 +128,7 @@ __all__ = [
     "BackwardEuler",
     "Bounded",
     "CahnHilliard",
+    "CoarseMeshWarning",
     "Connection",
     "CrankNicolson",
     "Curvature",

@@ -52,6 +52,15 @@ _LARGEST_RATIO = 1e5
 Watching = Callable[[str], support.Watch]
 
 
+# Where at a twentieth of the vertices the normals turn by more radians than this between a vertex and the farthest
+# neighbour of its fit, `Monotone` is as accurate as `Polynomial(4)` for Poisson's equation, on round and bumpy tori.
+_COARSE, _COARSE_SHARE = 0.95, 0.05
+
+
+class CoarseMeshWarning(UserWarning):
+    """The mesh is too coarse against the curvature of its surface for a polynomial fit to pay."""
+
+
 class InconsistentRowsWarning(UserWarning):
     """Some vertices have no consistent row of weights, so that the Laplacian is not accurate there."""
 
@@ -195,6 +204,27 @@ def warn_of_rows(report: SurfaceReport, scheme: Scheme, stacklevel: int) -> None
             f"of neighbours determine a polynomial of degree {scheme.degree}. The mesh is too coarse or too thin "
             "there: subdivide it, or use ltl.Monotone().",
             InconsistentRowsWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+def warn_of_coarse_mesh(topology: Topology, normals: np.ndarray, scheme: Scheme, stacklevel: int) -> None:
+    """Warn where the neighbours of a polynomial fit see too much of the curvature."""
+    if not isinstance(scheme, Polynomial):
+        return
+
+    def apart(block):
+        return np.linalg.norm(block.neighbours(normals) - block.centre(normals)[None], axis=2).max(axis=0)
+
+    turn = 2 * np.arcsin(np.minimum(topology.jet.map(apart) / 2, 1))
+    # Across a crease a turn says nothing about the smooth sides.
+    smooth = turn if topology.is_creased is None else turn[~topology.is_creased]
+    if smooth.size and (most := np.quantile(smooth, 1 - _COARSE_SHARE)) > _COARSE:
+        warnings.warn(
+            f"The mesh is coarse against its curvature: at {_COARSE_SHARE:.0%} of the vertices normals turn by more "
+            f"than {np.degrees(most):.0f} degrees over the neighbours of one fit. Where these are more than "
+            f"{np.degrees(_COARSE):.0f} degrees ltl.Monotone() is as accurate or more: use it, or subdivide the mesh.",
+            CoarseMeshWarning,
             stacklevel=stacklevel + 1,
         )
 

@@ -20,7 +20,7 @@ from .lifting.schemes import Geometry, Topology, conormals_in_frame, flux_weight
 from .mesh import one_rings
 from .operators import gradient
 from .progress import watched
-from .surface import Surface
+from .surface import Surface, on_device
 from .tables import (
     AnyArray,
     ReverseWeights,
@@ -216,7 +216,7 @@ def _with_divergence(surface: Surface, diffusion: AnyArray | float, drift: AnyAr
     return own if drift is None else own + jnp.asarray(drift, surface.dtype)
 
 
-@eqx.filter_jit
+@on_device
 def _apply(stencil: EllipticStencil, u: AnyArray) -> Array:
     return difference_sum(stencil.table, stencil.weights, u, stencil.reverse)
 

@@ -8,7 +8,6 @@ coordinates. Every operator is jit-compiled, linear in the field, and differenti
 import functools
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Array, Float
 
-from .surface import Surface
+from .surface import Surface, on_device
 from .tables import AnyArray, difference_matrix, difference_sum, differences, slot_sum
 
 # Below this size all eigenvalues are computed at once.
@@ -27,7 +26,7 @@ _PRODUCTS = 60
 _MARGIN = 1.5
 
 
-@eqx.filter_jit
+@on_device
 def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3"]:
     """The surface gradient of u, tangent, in ambient coordinates.
 
@@ -48,7 +47,7 @@ def gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S
     return _to_ambient(surface, *_gradient_in_frame(surface, u))
 
 
-@eqx.filter_jit
+@on_device
 def divergence(surface: Surface, X: Float[AnyArray, "V *C"]) -> Float[Array, "V *S"]:
     """The surface divergence of a tangent vector field, positive where the field spreads out.
 
@@ -71,7 +70,7 @@ def divergence(surface: Surface, X: Float[AnyArray, "V *C"]) -> Float[Array, "V 
     return _divergence_in_frame(surface, components[0], components[1])
 
 
-@eqx.filter_jit
+@on_device
 def laplacian(
     surface: Surface, u: Float[AnyArray, "V *S"], flux: Float[AnyArray, "..."] | None = None
 ) -> Float[Array, "V *S"]:
@@ -133,7 +132,7 @@ def add_flux(
     return rate.at[surface.topology.boundary].add(added, unique_indices=True)
 
 
-@eqx.filter_jit
+@on_device
 def weighted_laplacian(
     surface: Surface,
     conductivity: Float[AnyArray, " V"],
@@ -186,7 +185,7 @@ def _harmonic(here: Array, rise: Array) -> Array:
     return jnp.where(are_positive, 2 * (here / total) * there, 0)
 
 
-@eqx.filter_jit
+@on_device
 def hessian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3 3"]:
     """The covariant second derivative of u, symmetric and tangent, in ambient coordinates.
 
@@ -211,7 +210,7 @@ def hessian(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 
     return jnp.einsum("abv...,vac,vbd->v...cd", components, frames, frames)
 
 
-@eqx.filter_jit
+@on_device
 def integrate(
     surface: Surface, u: Float[AnyArray, "V *S"], measure: Float[AnyArray, " V"] | None = None
 ) -> Float[Array, "*S"]:
@@ -274,7 +273,7 @@ def growth_rate(surface: Surface) -> float:
     return float(found.real.max())
 
 
-@eqx.filter_jit
+@on_device
 def spectral_bound(surface: Surface) -> Float[Array, ""]:
     """An upper bound of the magnitude of the Laplacian's eigenvalues, by Gershgorin's discs.
 
@@ -304,7 +303,8 @@ def spectral_width(surface: Surface) -> Float[Array, ""]:
     if surface.geometry.spectral_width is not None:
         return surface.geometry.spectral_width
     if not surface.is_traced:
-        width = surface.remembered("spectral width", lambda: _measured_width(surface))
+        with jax.ensure_compile_time_eval():
+            width = surface.remembered("spectral width", lambda: _measured_width(surface))
         return jnp.asarray(width, surface.dtype)
     weights = surface.geometry.laplacian_weights
     if surface.topology.diffusion is None or weights is None:

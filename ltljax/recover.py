@@ -14,6 +14,7 @@ import tomli_w
 
 from .fit import Experiment, Fit, Observations, Positive, fit
 from .lifting.schemes import Scheme
+from .progress import noted
 from .scenario import Scenario
 from .surface import FarFromOriginWarning, Surface
 

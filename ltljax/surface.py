@@ -20,9 +20,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .conservation import stationary_measure
-from .construction import SurfaceReport, freeze, warn_of_rows, with_reverse
+from .construction import SurfaceReport, freeze, warn_of_coarse_mesh, warn_of_rows, with_reverse
 from .lifting.schemes import Geometry, Monotone, Scheme, Topology, weigh
 from .mesh import Mesh, far_middle
+from .mesh.arguments import as_numbers
 from .progress import Laps, watched
 from .tables import AnyArray, difference_matrix, slot_sum
 
@@ -77,6 +78,7 @@ class Surface(eqx.Module):
         Warns:
             InconsistentRowsWarning: at some vertices `Monotone` found no consistent non-negative row and could not use
                 the cotangent row, or `Polynomial` found no neighbours that determine its fit.
+            CoarseMeshWarning: `Polynomial` is less accurate than `Monotone` on so coarse a mesh.
             FarFromOriginWarning: positions are relative to ``surface.centre``.
         """
         if not isinstance(mesh, Mesh):
@@ -103,6 +105,7 @@ class Surface(eqx.Module):
                 f"{jnp.dtype(dtype).name}. Rescale the mesh (mesh.scaled(factor)) or use float64."
             )
         warn_of_rows(report, scheme, stacklevel=2)
+        warn_of_coarse_mesh(topology, geometry.normals, scheme, stacklevel=2)
         if centre.any():
             warnings.warn(
                 f"The mesh lies far from the origin: the positions of its surface are relative to surface.centre, "
@@ -237,6 +240,24 @@ class Surface(eqx.Module):
     def dtype(self):
         """The float type of the weights."""
         return self.geometry.vertices.dtype
+
+
+def on_device(function: Callable) -> Callable:
+    """The function jit-compiled; masked arrays, which would become arrays without their masks, are refused.
+
+    Raises:
+        ValueError: an argument is a masked array.
+    """
+    compiled = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def checked(*arguments, **named):
+        for value in (*arguments, *named.values()):
+            if isinstance(value, np.ma.MaskedArray):
+                as_numbers(f"the argument of {function.__name__}", value)
+        return compiled(*arguments, **named)
+
+    return checked
 
 
 _weigh = eqx.filter_jit(weigh)

@@ -20,7 +20,7 @@ from .lifting.intrinsic import Paths
 from .lifting.layout import PerBlock
 from .lifting.schemes import places
 from .operators import divergence, gradient, laplacian
-from .surface import Surface
+from .surface import Surface, on_device
 from .tables import AnyArray, ReverseWeights, Table, difference_sum, reverse_weights, slot_sum
 
 # The share of a vector that may stand on its tangent plane before it counts as a mistake.
@@ -48,7 +48,7 @@ class Connection(eqx.Module):
         return _turned_sum(self, z)
 
 
-@eqx.filter_jit
+@on_device
 def connection(surface: Surface, symmetry: int = 1) -> Connection:
     """The vector Laplacian of a surface, weighed once: for many applications, as in time stepping.
 
@@ -73,14 +73,14 @@ def connection(surface: Surface, symmetry: int = 1) -> Connection:
     return Connection(table, (x, y), centre, (reverse_weights(table, x), reverse_weights(table, y)))
 
 
-@eqx.filter_jit
+@on_device
 def to_frame(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 2"]:
     """The components of vectors in the frames of the vertices; their normal part is left out."""
     check_vectors(surface, X)
     return jnp.einsum("v...c,vac->v...a", X, surface.geometry.frames)
 
 
-@eqx.filter_jit
+@on_device
 def from_frame(surface: Surface, z: Float[AnyArray, "V *S 2"]) -> Float[Array, "V *S 3"]:
     """The tangent vectors of components in the frames of the vertices."""
     if z.ndim < 2 or z.shape[-1] != 2 or z.shape[0] != surface.num_vertices:
@@ -88,26 +88,26 @@ def from_frame(surface: Surface, z: Float[AnyArray, "V *S 2"]) -> Float[Array, "
     return jnp.einsum("v...a,vac->v...c", z, surface.geometry.frames)
 
 
-@eqx.filter_jit
+@on_device
 def tangential(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """The tangent part of vectors."""
     return from_frame(surface, to_frame(surface, X))
 
 
-@eqx.filter_jit
+@on_device
 def rotated(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """The tangent part of X turned by a right angle, counter-clockwise seen from outside: n x X."""
     check_vectors(surface, X)
     return jnp.cross(_beside(surface.normals, X), X)
 
 
-@eqx.filter_jit
+@on_device
 def rotated_gradient(surface: Surface, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S 3"]:
     """n x grad u, which follows the contours of u with larger values to its right, and has no divergence."""
     return rotated(surface, gradient(surface, u))
 
 
-@eqx.filter_jit
+@on_device
 def curl(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S"]:
     """The curl of a tangent field, a number: n . (rot X), positive where it turns counter-clockwise.
 
@@ -123,7 +123,7 @@ def curl(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S"]
     return -divergence(surface, rotated(surface, X))
 
 
-@eqx.filter_jit
+@on_device
 def covariant_derivative(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3 3"]:
     """The derivative of a tangent field along the surface, a tangent tensor: ``D @ w`` is that of X in the direction w.
 
@@ -152,7 +152,7 @@ def covariant_derivative(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Floa
     return jnp.einsum("v...ab,vac,vbd->v...cd", components, frames, frames)
 
 
-@eqx.filter_jit
+@on_device
 def vector_laplacian(
     surface: Surface, X: Float[AnyArray, "V *S 3"], along: Connection | None = None
 ) -> Float[Array, "V *S 3"]:
@@ -195,7 +195,7 @@ def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Arr
     return _hodge_laplacian(surface, curvature(surface).gauss, X)
 
 
-@eqx.filter_jit
+@on_device
 def _hodge_laplacian(surface: Surface, gauss: Array, X: AnyArray) -> Array:
     is_creased = surface.topology.is_creased
     if is_creased is not None:
@@ -203,7 +203,7 @@ def _hodge_laplacian(surface: Surface, gauss: Array, X: AnyArray) -> Array:
     return vector_laplacian(surface, X) - _beside(gauss, X) * tangential(surface, X)
 
 
-@eqx.filter_jit
+@on_device
 def tensor_laplacian(surface: Surface, T: Float[AnyArray, "V *S 3 3"]) -> Float[Array, "V *S 3 3"]:
     """The Laplacian of a field of symmetric tangent tensors, such as Hessians or structure tensors.
 
@@ -227,7 +227,7 @@ def tensor_laplacian(surface: Surface, T: Float[AnyArray, "V *S 3 3"]) -> Float[
     return jnp.einsum("v...ab,vac,vbd->v...cd", changed, frames, frames)
 
 
-@eqx.filter_jit
+@on_device
 def lie_derivative(surface: Surface, X: Float[AnyArray, "V 3"], u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
     """X . grad u: how fast u changes for one who is carried along by X. Of the gradient's order.
 
@@ -243,7 +243,7 @@ def lie_derivative(surface: Surface, X: Float[AnyArray, "V 3"], u: Float[AnyArra
     return jnp.einsum("vc,v...c->v...", X, gradient(surface, u))
 
 
-@eqx.filter_jit
+@on_device
 def lie_bracket(surface: Surface, X: Float[AnyArray, "V 3"], Y: Float[AnyArray, "V 3"]) -> Float[Array, "V 3"]:
     """[X, Y], the derivative of Y along X less that of X along Y: zero where their flows commute."""
     _check_one(surface, X)
@@ -282,7 +282,7 @@ def transport_along(
     return _carried(surface, jnp.asarray(path), vector)
 
 
-@eqx.filter_jit
+@on_device
 def _carried(surface: Surface, path: Array, vector: Array) -> Array:
     normals = surface.normals[path].reshape(-1, *(1,) * (vector.ndim - 1), 3)
 
@@ -296,7 +296,7 @@ def _carried(surface: Surface, path: Array, vector: Array) -> Array:
     return jnp.concatenate([start[None], after])
 
 
-@eqx.filter_jit
+@on_device
 def singularities(surface: Surface, X: Float[AnyArray, "V 3"], symmetry: int = 1) -> Float[Array, " F"]:
     """The index of a field in every face: how often it turns, counter-clockwise, on the way around; mostly zero.
 

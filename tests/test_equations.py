@@ -213,3 +213,12 @@ def test_both_means_of_a_smooth_conductivity_are_of_the_same_order():
     for found in errors.values():
         assert found[1] < 0.4 * found[0]
         assert found[1] < 0.02
+
+
+@pytest.mark.parametrize(
+    "function", [ltl.laplacian, ltl.gradient, ltl.hessian, ltl.integrate, ltl.poisson, ltl.rotated_gradient]
+)
+def test_operators_refuse_masked_fields(function):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    with pytest.raises(ValueError, match="whose mask would be lost"):
+        function(surface, np.ma.masked_greater(np.arange(42.0), 9))

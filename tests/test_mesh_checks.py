@@ -365,3 +365,12 @@ def test_the_report_is_a_table_and_plain_data():
     assert "2 loops of 8, 8 edges" in str(mesh.report)
     assert len({len(re.match(r"[^0-9]*?\s\s+", line).group()) for line in lines[:4]}) == 1
     assert repr(mesh) == "Mesh(24 vertices, 32 faces, 2 boundary loops)"
+
+
+def test_masked_positions_and_faces_are_refused():
+    tetrahedron = np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    for which in (0, 1):
+        given = list(tetrahedron)
+        given[which] = np.ma.masked_array(given[which], np.zeros(given[which].shape, bool))
+        with pytest.raises(ltl.MeshError, match="whose mask would be lost"):
+            ltl.Mesh(*given)

@@ -1,5 +1,7 @@
 """`ltl.Polynomial()`: its orders, the jets it shares with `Monotone()`, the spectrum check, and curvature."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -184,3 +186,13 @@ def test_the_published_scheme_says_what_it_lacks():
         ltl.laplacian(surface, surface.vertices[:, 0], flux=surface.vertices[:, 0])
     with pytest.raises(ValueError, match=r"Only Monotone\(\)"):
         _ = surface.mass
+
+
+def test_a_mesh_on_which_a_fit_of_high_degree_does_not_pay_is_said():
+    with pytest.warns(ltl.CoarseMeshWarning, match=r"ltl\.Monotone\(\) is as accurate or more"):
+        ltl.Surface.from_mesh(ltl.shapes.torus(2.0, 1.0, 28, 14), ltl.Polynomial())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ltl.CoarseMeshWarning)
+        ltl.Surface.from_mesh(ltl.shapes.torus(2.0, 1.0, 80, 40), ltl.Polynomial())
+        # A crease is no curvature of the smooth sides.
+        ltl.Surface.from_mesh(ltl.shapes.box(n=8), ltl.Polynomial())

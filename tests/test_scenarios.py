@@ -564,3 +564,11 @@ def test_a_file_without_data_says_what_to_add(tmp_path, capsys):
     assert "no table [fit]" in capsys.readouterr().err
     assert main(["fit", "gray-scott"]) == 2
     assert "ends in .toml" in capsys.readouterr().err
+
+
+def test_a_scenario_runs_with_fixed_steps_of_sbdf2(tmp_path):
+    (tmp_path / "my.toml").write_text(
+        PLAIN.replace("[initial]", '[solver]\nname = "SBDF2"\ndt = 1e-3\n[initial]'), encoding="utf-8"
+    )
+    assert main(["run", str(tmp_path / "my.toml"), "--out", str(tmp_path / "out"), "--set", "time.end=0.01"]) == 0
+    assert json.loads((tmp_path / "out/summary.json").read_text())["reached_time"] == pytest.approx(0.01)

@@ -102,14 +102,14 @@ class ReactionDiffusion(Equation):
         # frequency is at most the spectral radius of what is off the diagonal.
         turning = jnp.sqrt(jnp.maximum(-jacobian * jnp.swapaxes(jacobian, 1, 2), 0))
         if u.shape[1] > 2:
-            turning = jnp.abs(jacobian) * (1 - jnp.eye(u.shape[1], dtype=u.dtype))
+            turning = jnp.abs(jacobian) * (1 - jnp.eye(u.shape[1], dtype=u.dtype))[None]
         return spread_width(surface, self.diffusivity, u) + 2 * jnp.max(_spectral_radius(turning))
 
     def _jacobian(self, u: Array) -> Array:
-        """The derivatives of the reaction's rates at every vertex, (V, S, S)."""
+        """The derivatives of the reaction's rates at every vertex, (V, S, S); what bounds steps has no derivatives."""
         species = jnp.eye(u.shape[1], dtype=u.dtype)
         columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in species]
-        return jnp.stack(columns, axis=2)
+        return jax.lax.stop_gradient(jnp.stack(columns, axis=2))
 
     def _check(self, u: Array) -> None:
         if u.ndim != 2 or u.shape[1] != self.num_species:

@@ -67,7 +67,15 @@ class Polynomial:
     """Polynomial fits of degree 3 or 4 on about twice the neighbours they need, for smooth solutions on good meshes.
 
     Normals, gradient and Hessian come from the same fit, and the Laplacian takes the metric of the fitted surface into
-    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4. If a fit would cross a
+    account. Stationary solutions are of order 2 for degree 3 and 4 for degree 4.
+
+    Degree 4 pays where normals turn by less than a radian over the neighbours of a fit. For Poisson's equation on a
+    jittered torus with radii 2 and 1 its error is that of `Monotone` at 800 vertices, 0.4 of it at 1,600 and a tenth
+    at 6,300; with bumps on the torus it is 1.6 times that of `Monotone` even at 6,300. On coarser meshes
+    `CoarseMeshWarning` says so. Degree 3 has twice the error of `Monotone` there at every size: it is for gradients and
+    curvature.
+
+    If a fit would cross a
     crease it is made in the intrinsic chart of the vertex, which is exact where both sides are flat and first
     order where they are curved. Weights of both signs: there is no maximum principle, and on bad meshes the Laplacian
     can have growing modes; `solve` looks for them before it steps.
