@@ -72,6 +72,8 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
     if not 1 <= k <= size - 2:
         raise ValueError(f"Expected a number of modes from 1 to {size - 2}, found {k}.")
     conditions = bounds.as_tuple(boundary)
+    if any(condition.species is not None for condition in conditions):
+        raise ValueError("A condition for some species belongs to a state of several; modes are of one field.")
     zero = jnp.zeros(size, surface.dtype)
     held = np.asarray(bounds.held_vertices(surface, conditions))
     lost = np.asarray(bounds.absorption(surface, conditions, jnp.zeros((), surface.dtype), zero)) if conditions else 0
@@ -107,19 +109,21 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
     values, right, left = np.zeros(0), np.zeros((size, 0)), np.zeros((size, 0))
     # The iteration starts from one vector, and of an eigenvalue with several modes it sees the others by rounding only.
     # So it is run again without what was found, until what is left lies above.
-    wanted = k + _MORE
-    while wanted > 0:
+    count = min(k + _MORE, size - 2)
+    while count > 0:
         inverse = _Deflated(factors, shift, values, right, left)
-        count = min(wanted, size - len(values) - 2)
         further, more_right = _real(*_iterated(matrix, inverse, count, shift, "N"))
         _, more_left = _real(*_iterated(matrix, inverse, count, shift, "T"))
+        # Each side leaves out the last one if its partner was not computed.
+        complete = min(more_right.shape[1], more_left.shape[1])
+        further, more_right, more_left = further[:complete], more_right[:, :complete], more_left[:, :complete]
         more_left = more_left @ np.linalg.inv(more_right.T @ more_left)
-        is_missing = further < (np.inf if len(values) < k else values[k - 1])
-        wanted = _MORE if is_missing.any() and size - len(values) > 2 * _MORE else 0
+        is_missing = further < (values[k - 1] if len(values) >= k else np.inf)
         right, left = np.hstack([right, more_right]), np.hstack([left, more_left])
-        order = np.argsort(np.concatenate([values, further]), kind="stable")
-        values = np.concatenate([values, further])[order]
-        right, left = right[:, order], left[:, order]
+        values = np.concatenate([values, further])
+        order = np.argsort(values, kind="stable")
+        values, right, left = values[order], right[:, order], left[:, order]
+        count = min(_MORE, size - len(values) - 2) if is_missing.any() else 0
     return values[:k], right[:, :k], left[:, :k]
 
 
@@ -160,14 +164,15 @@ def _real(values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
     """Real eigenvalues in ascending order, with real vectors that span the same spaces.
 
     Discretisation can turn two real eigenvalues that nearly coincide into a complex pair. The two vectors of such a
-    pair are replaced by the real and the imaginary part of one of them.
+    pair are replaced by the real and the imaginary part of one of them. The last vector that was computed can lack its
+    partner: alone it spans no such space, and is left out.
     """
-    out, is_free = vectors.real.copy(), values.imag < 0
+    out, is_free, is_whole = vectors.real.copy(), values.imag < 0, values.imag == 0
     for i in np.flatnonzero(values.imag > 0):
         distance = np.where(is_free, np.abs(values - values[i].conj()), np.inf)
         partner = int(np.argmin(distance))
-        # The last of the computed vectors can lack its partner: its real part is kept alone.
         if distance[partner] <= 1e-6 * np.abs(values[i]):
             out[:, partner], is_free[partner] = vectors[:, i].imag, False
-    order = np.argsort(values.real, kind="stable")
+            is_whole[[i, partner]] = True
+    order = np.flatnonzero(is_whole)[np.argsort(values.real[is_whole], kind="stable")]
     return values.real[order], (out / np.linalg.norm(out, axis=0))[:, order]
