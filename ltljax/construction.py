@@ -217,45 +217,31 @@ def _choose_neighbours(
     if chart is not None:
         angles, chart_directions, charts = chart.angles, chart.directions, chart.charts
     around = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
-    reach = reach_along(rings, around, charts, topology.is_extrinsic)
-    nearest = reach(np.arange(mesh.num_vertices), 1)
-    one_ring = support.Rows.all_of(nearest)
+
+    def reach_of(is_extrinsic: np.ndarray | None) -> support.Reach:
+        return reach_along(rings, around, charts, is_extrinsic)
+
+    nearest = reach_of(topology.is_extrinsic)(np.arange(mesh.num_vertices), 1)
     watch_gradient = watch("choosing the neighbours of the gradient")
-    jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach, watch_gradient)
-    report = SurfaceReport(flips=0 if chart is None else chart.num_flips)
-    if on_crease is not None:
-        is_wide = np.full(mesh.num_vertices, isinstance(scheme, Polynomial))
-        is_wide[wide] = True
-        is_creased = on_crease | (is_wide & _meets(jet, on_crease))
-        is_creased &= ~is_folded
-        if is_creased.any():
-            topology = dataclasses.replace(topology, is_creased=is_creased)
-            report = dataclasses.replace(report, creased=np.flatnonzero(is_creased))
-        if isinstance(scheme, Polynomial) and is_creased.any():
-            # Those rows are laid out in charts, and chosen again.
-            topology = dataclasses.replace(topology, is_extrinsic=~is_creased)
-            mixed = reach_along(rings, around, charts, ~is_creased)
-            jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, mixed, watch_gradient)
-    topology = dataclasses.replace(topology, **_table_of("jet", jet, topology, chart))
-    report = dataclasses.replace(report, wide_gradient_rows=wide, undetermined=undetermined)
+    topology, report = _choose_gradient(
+        scheme, topology, reach_of, nearest, chart, on_crease, is_folded, watch_gradient
+    )
     laps.end("gradient rows")
     if isinstance(scheme, Polynomial):
         topology = dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths)
         return topology, angles, report
 
-    places = around
     if chart is None or topology.is_extrinsic is not None:
         # Rows in space are chosen in the tangent planes they will be weighed in.
         normals = surface_normals(scheme, vertices, topology)
         frames, _ = vertex_frames(vertices, normals, topology)
-        places = places_in(scheme, topology, vertices, normals, frames, chart_directions)
-        reach = reach_along(rings, places, charts, topology.is_extrinsic)
-        nearest = reach(np.arange(mesh.num_vertices), 1)
+        around = places_in(scheme, topology, vertices, normals, frames, chart_directions)
+        nearest = reach_of(topology.is_extrinsic)(np.arange(mesh.num_vertices), 1)
     topology, report = _choose_diffusion(
         scheme,
         topology,
-        places,
-        reach,
+        around,
+        reach_of(topology.is_extrinsic),
         nearest,
         chart,
         watch("choosing the neighbours of the Laplacian"),
@@ -263,6 +249,36 @@ def _choose_neighbours(
     )
     laps.end("Laplacian rows")
     return topology, angles, report
+
+
+def _choose_gradient(
+    scheme: Monotone | Polynomial,
+    topology: Topology,
+    reach_of: Callable[[np.ndarray | None], support.Reach],
+    nearest: Neighbourhood,
+    chart: "_Chart | None",
+    on_crease: np.ndarray | None,
+    is_folded: np.ndarray,
+    watch: support.Watch,
+) -> tuple[Topology, SurfaceReport]:
+    """The rows of the gradient. ``reach_of(is_extrinsic)`` finds wider neighbourhoods, in space for the marked
+    vertices; ``nearest`` holds the one-rings, already laid out."""
+    one_ring = support.Rows.all_of(nearest)
+    report = SurfaceReport(flips=0 if chart is None else chart.num_flips)
+    jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach_of(topology.is_extrinsic), watch)
+    if on_crease is not None:
+        is_wide = np.full(len(on_crease), isinstance(scheme, Polynomial))
+        is_wide[wide] = True
+        is_creased = (on_crease | (is_wide & _meets(jet, on_crease))) & ~is_folded
+        if is_creased.any():
+            topology = dataclasses.replace(topology, is_creased=is_creased)
+            report = dataclasses.replace(report, creased=np.flatnonzero(is_creased))
+            if isinstance(scheme, Polynomial):
+                # Those rows are laid out in charts, and chosen again.
+                topology = dataclasses.replace(topology, is_extrinsic=~is_creased)
+                jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach_of(~is_creased), watch)
+    topology = dataclasses.replace(topology, **_table_of("jet", jet, topology, chart))
+    return topology, dataclasses.replace(report, wide_gradient_rows=wide, undetermined=undetermined)
 
 
 def _choose_diffusion(

@@ -120,13 +120,16 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _real(values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Real eigenvalues, ascending, and vectors of the same spaces: of a pair that is complex by discretisation its real
-    and its imaginary part."""
+    """Real eigenvalues in ascending order, with real vectors that span the same spaces.
+
+    Discretisation can turn two real eigenvalues that nearly coincide into a complex pair. The two vectors of such a
+    pair are replaced by the real and the imaginary part of one of them.
+    """
     out, is_free = vectors.real.copy(), values.imag < 0
     for i in np.flatnonzero(values.imag > 0):
         distance = np.where(is_free, np.abs(values - values[i].conj()), np.inf)
         partner = int(np.argmin(distance))
-        # Of a pair that is cut there is one.
+        # The last of the computed vectors can lack its partner: its real part is kept alone.
         if distance[partner] <= 1e-6 * np.abs(values[i]):
             out[:, partner], is_free[partner] = vectors[:, i].imag, False
     order = np.argsort(values.real, kind="stable")
