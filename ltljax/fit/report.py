@@ -131,7 +131,9 @@ def _flat(tree: Any) -> np.ndarray:
 def _sentence(names: tuple[str, ...], direction: np.ndarray, share: float, verb: str, told: str) -> str:
     """What a direction (n,) of relative changes does to the predictions, a share of their spread when of length one."""
     largest = np.abs(direction).max()
-    change = direction / largest * np.sign(direction[np.abs(direction).argmax()])
+    # Of several that change as much the first one grows, whatever rounding makes of them.
+    first = np.flatnonzero(np.abs(direction) > 0.9 * largest)[0]
+    change = direction / largest * np.sign(direction[first])
     parts = [f"{name} {10 * c:+.2g} %" for name, c in zip(names, change, strict=True) if abs(c) > 0.05]
     effect = 0.1 * share * np.linalg.norm(change)
     what = f"{parts[0].rsplit(' ', 2)[0]} alone" if len(parts) == 1 else "these apart"

@@ -19,6 +19,8 @@ from ..surface import Surface
 
 # Below this size all eigenvalues are computed at once.
 _DENSE = 300
+# How many modes beyond those asked for are computed.
+_MORE = 6
 
 
 class Eigenmodes(eqx.Module):
@@ -101,36 +103,74 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
     factors = scipy.sparse.linalg.splu(
         scipy.sparse.csc_matrix(matrix - shift * scipy.sparse.eye_array(matrix.shape[0]))
     )
-    start = np.random.default_rng(0).normal(size=matrix.shape[0])
-    # Somewhat more than asked for, so that no member of a multiplet is missed.
-    count = min(k + 6, matrix.shape[0] - 2)
-    found = []
-    for side, transposed in (("N", matrix), ("T", matrix.T)):
-        operator: Any = scipy.sparse.linalg.LinearOperator
-        inverse = operator(
-            matrix.shape, matvec=lambda v, side=side: factors.solve(np.ascontiguousarray(v).ravel(), trans=side),
-            dtype=np.float64,
-        )  # fmt: skip
-        options: Any = dict(k=count, sigma=shift, OPinv=inverse, v0=start, ncv=max(2 * count + 1, 20))
-        pairs: Any = scipy.sparse.linalg.eigs(scipy.sparse.csc_array(transposed), **options)
-        found.append(_real(*pairs))
-    (values, right), (_, left) = found
-    left = left @ np.linalg.inv(right.T @ left)
+    size = matrix.shape[0]
+    values, right, left = np.zeros(0), np.zeros((size, 0)), np.zeros((size, 0))
+    # The iteration starts from one vector, and of an eigenvalue with several modes it sees the others by rounding only.
+    # So it is run again without what was found, until what is left lies above.
+    count = min(k + _MORE, size - 2)
+    while count > 0:
+        inverse = _Deflated(factors, shift, values, right, left)
+        further, more_right = _real(*_iterated(matrix, inverse, count, shift, "N"))
+        _, more_left = _real(*_iterated(matrix, inverse, count, shift, "T"))
+        # Each side leaves out the last one if its partner was not computed.
+        complete = min(more_right.shape[1], more_left.shape[1])
+        further, more_right, more_left = further[:complete], more_right[:, :complete], more_left[:, :complete]
+        more_left = more_left @ np.linalg.inv(more_right.T @ more_left)
+        is_missing = further < (values[k - 1] if len(values) >= k else np.inf)
+        right, left = np.hstack([right, more_right]), np.hstack([left, more_left])
+        values = np.concatenate([values, further])
+        order = np.argsort(values, kind="stable")
+        values, right, left = values[order], right[:, order], left[:, order]
+        count = min(_MORE, size - len(values) - 2) if is_missing.any() else 0
     return values[:k], right[:, :k], left[:, :k]
+
+
+class _Deflated:
+    """The inverse of a matrix less a shift, on the complement of the modes that were found.
+
+    Args:
+        factors: of the shifted matrix.
+        shift: what was subtracted.
+        values: (n,) found eigenvalues.
+        right: (V, n) their vectors.
+        left: (V, n) those of the transposed matrix, with ``left.T @ right`` the identity.
+    """
+
+    def __init__(self, factors: Any, shift: float, values: np.ndarray, right: np.ndarray, left: np.ndarray):
+        self.factors, self.right, self.left = factors, right, left
+        self.inverse = 1 / (values - shift)
+
+    def __call__(self, v: np.ndarray, side: str) -> np.ndarray:
+        """The product with a vector, for the side ``"T"`` of the transposed inverse."""
+        v = np.ascontiguousarray(v).ravel()
+        right, left = (self.right, self.left) if side == "N" else (self.left, self.right)
+        return self.factors.solve(v, trans=side) - right @ (self.inverse * (left.T @ v))
+
+
+def _iterated(matrix: Any, inverse: _Deflated, count: int, shift: float, side: str) -> Any:
+    """The eigenvalues next to the shift, and their vectors, by Arnoldi iteration."""
+    operator: Any = scipy.sparse.linalg.LinearOperator
+    start = np.random.default_rng(0).normal(size=matrix.shape[0])
+    options: Any = dict(
+        k=count, sigma=shift, v0=start, ncv=min(max(2 * count + 1, 20), matrix.shape[0]),
+        OPinv=operator(matrix.shape, matvec=lambda v: inverse(v, side), dtype=np.float64),
+    )  # fmt: skip
+    return scipy.sparse.linalg.eigs(scipy.sparse.csc_array(matrix if side == "N" else matrix.T), **options)
 
 
 def _real(values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
     """Real eigenvalues in ascending order, with real vectors that span the same spaces.
 
     Discretisation can turn two real eigenvalues that nearly coincide into a complex pair. The two vectors of such a
-    pair are replaced by the real and the imaginary part of one of them.
+    pair are replaced by the real and the imaginary part of one of them. The last vector that was computed can lack its
+    partner: alone it spans no such space, and is left out.
     """
-    out, is_free = vectors.real.copy(), values.imag < 0
+    out, is_free, is_whole = vectors.real.copy(), values.imag < 0, values.imag == 0
     for i in np.flatnonzero(values.imag > 0):
         distance = np.where(is_free, np.abs(values - values[i].conj()), np.inf)
         partner = int(np.argmin(distance))
-        # The last of the computed vectors can lack its partner: its real part is kept alone.
         if distance[partner] <= 1e-6 * np.abs(values[i]):
             out[:, partner], is_free[partner] = vectors[:, i].imag, False
-    order = np.argsort(values.real, kind="stable")
+            is_whole[[i, partner]] = True
+    order = np.flatnonzero(is_whole)[np.argsort(values.real[is_whole], kind="stable")]
     return values.real[order], (out / np.linalg.norm(out, axis=0))[:, order]
