@@ -136,7 +136,8 @@ class Surface(eqx.Module):
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"Expected vertices of shape {self.vertices.shape}, found {vertices.shape}.")
-        if not isinstance(vertices, Tracer) and (middle := far_middle(np.asarray(vertices))).any():
+        is_known = not isinstance(vertices, Tracer) and not self.is_traced
+        if is_known and self.centre.any() and (middle := far_middle(np.asarray(vertices))).any():
             raise ValueError(
                 f"Expected positions relative to surface.centre, found positions about {_in_words(middle)}. Take the "
                 "centre from them in double precision, or build a new surface of a mesh."
@@ -268,10 +269,14 @@ _REMEMBERED: dict[int, dict[str, Any]] = {}
 
 def _is_in_range(geometry: Geometry) -> bool:
     """Whether all numbers are finite, and those that go with the squared length large enough to have all digits."""
-    squares = jax.tree.leaves((geometry.laplacian_weights, geometry.hessian_weights, geometry.vertex_areas))
+    # Rows of several blocks together: all that one block has of them may be zero.
+    squares = (geometry.laplacian_weights, *(geometry.hessian_weights or ()), geometry.vertex_areas)
     is_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry))
-    least = np.finfo(squares[0].dtype).tiny / np.finfo(squares[0].dtype).eps
-    return is_finite and all(leaf.size == 0 or np.abs(leaf).max() > least for leaf in squares)
+    largest = [
+        max(np.abs(leaf).max(initial=0) for leaf in jax.tree.leaves(group)) for group in squares if group is not None
+    ]
+    precision = np.finfo(geometry.vertices.dtype)
+    return is_finite and all(size > precision.tiny / precision.eps for size in largest)
 
 
 def _in_words(point: np.ndarray) -> str:

@@ -427,13 +427,6 @@ def test_modes_of_large_multiplets_are_real_and_biorthonormal():
     np.testing.assert_allclose(modes.left.T @ modes.vectors, np.eye(81), atol=1e-12)
 
 
-def test_no_member_of_a_multiplet_is_missed_where_the_mesh_has_its_symmetry():
-    # The eigenvalue of the fifth to the seventh mode of a cube is threefold to rounding, which one start sees once.
-    surface = ltl.Surface.from_mesh(ltl.shapes.box(n=8))
-    exact = np.sort(np.linalg.eigvals(-ltl.laplacian_matrix(surface).toarray()).real)
-    np.testing.assert_allclose(ltl.eigenmodes(surface, 20).values, exact[:20], rtol=1e-8, atol=1e-9)
-
-
 @pytest.mark.parametrize("k", [7, 20, 384])
 def test_no_member_of_a_multiplet_is_missed_where_the_mesh_has_its_symmetry(k):
     # Eigenvalues of a cube are threefold to rounding, of which an iteration from one start sees one.

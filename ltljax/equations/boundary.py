@@ -5,6 +5,7 @@ Where nothing is said the normal derivative vanishes. Of two conditions for the 
 """
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -26,9 +27,13 @@ Data = Any
 
 
 def _species(given: Species) -> Species:
-    if given is None or isinstance(given, int):
-        return given
-    return tuple(int(species) for species in given)
+    if given is None:
+        return None
+    return (
+        tuple(operator.index(species) for species in given)
+        if isinstance(given, tuple | list)
+        else operator.index(given)
+    )
 
 
 class Neumann(eqx.Module):

@@ -36,7 +36,7 @@ def as_spreads(given: Any) -> Spreads:
 
 def are_numbers(spreads: Spreads, u: Float[Array, "V *S"]) -> bool:
     """Whether every species has a number as its diffusivity."""
-    return not isinstance(spreads, tuple | EllipticStencil) and spreads.shape in ((), u.shape[1:])
+    return not isinstance(spreads, tuple | EllipticStencil) and jnp.shape(spreads) in ((), u.shape[1:])
 
 
 def of_each(spreads: Spreads, u: Float[Array, "V *S"]) -> tuple[Spread, ...]:
@@ -47,7 +47,7 @@ def of_each(spreads: Spreads, u: Float[Array, "V *S"]) -> tuple[Spread, ...]:
     """
     size, count = u.shape[0], u[0].size
     if are_numbers(spreads, u):
-        return tuple(jnp.broadcast_to(cast(Array, spreads).astype(u.dtype), (count,)))
+        return tuple(jnp.broadcast_to(jnp.asarray(spreads, u.dtype), (count,)))
     each = spreads if isinstance(spreads, tuple) else (spreads,) * count
     if len(each) != count:
         raise ValueError(f"Expected one diffusivity for each of {count} species, found {len(each)}.")
@@ -67,7 +67,7 @@ def spread_rate(
 ) -> Float[Array, "V *S"]:
     """What diffusion makes of a state that keeps the conditions, with the fluxes they let through."""
     if are_numbers(spreads, u):
-        numbers = jnp.broadcast_to(cast(Array, spreads).astype(u.dtype), u.shape[1:])
+        numbers = jnp.broadcast_to(jnp.asarray(spreads, u.dtype), u.shape[1:])
         return numbers[None] * bounds.bounded_laplacian(surface, conditions, t, u)
     columns, flux = u.reshape(len(u), -1), bounds.fluxes(surface, conditions, t, u)
     rates = []
@@ -98,7 +98,7 @@ def spread_bound(
     laplacian = spectral_bound(surface)
     if are_numbers(spreads, u):
         stiffness = bounds.stiffness(surface, conditions, t, u)
-        return _largest(cast(Array, spreads)).astype(u.dtype) * (laplacian + stiffness)
+        return _largest(jnp.asarray(spreads, u.dtype)) * (laplacian + stiffness)
     return _most(bound, of_each(spreads, u))
 
 

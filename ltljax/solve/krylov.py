@@ -18,7 +18,7 @@ from jaxtyping import Array
 def unit_of(x: Array) -> Array:
     """The power of two above a magnitude (any shape), and one in place of zero: to divide by without rounding, so that
     squares stay within the range of the float type."""
-    exponent = jnp.frexp(jax.lax.stop_gradient(jnp.abs(x)))[1]
+    exponent = jnp.minimum(jnp.frexp(jax.lax.stop_gradient(jnp.abs(x)))[1], jnp.finfo(x.dtype).maxexp - 1)
     return jnp.where((x == 0) | ~jnp.isfinite(x), 1, jnp.ldexp(jnp.ones_like(x), exponent))
 
 

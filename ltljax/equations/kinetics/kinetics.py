@@ -63,7 +63,7 @@ def _together(rates: Rates, u: Array, params: Any) -> Array:
         if "values to unpack" not in str(error):
             raise
         raise ValueError(f"The state has {count} species, and the reaction is for another number: {error}.") from error
-    columns = (found,) if isinstance(found, jax.Array) and found.ndim < 2 and count == 1 else tuple(found)
+    columns = (found,) if count == 1 and not isinstance(found, tuple | list) and jnp.ndim(found) < 2 else tuple(found)
     if len(columns) != count or any(jnp.shape(column) not in ((), u.shape[:1]) for column in columns):
         shapes = ", ".join(str(jnp.shape(column)) for column in columns[:5])
         raise ValueError(
