@@ -105,9 +105,9 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
     )
     size = matrix.shape[0]
     values, right, left = np.zeros(0), np.zeros((size, 0)), np.zeros((size, 0))
-    # The iteration starts from one vector. If an eigenvalue has several modes, that vector contains only one combination
-    # of them, and the others appear by rounding alone. The iteration is therefore repeated on the complement of the
-    # modes found so far, until the eigenvalues of that complement are larger than the k wanted ones.
+    # The iteration starts from one vector. If an eigenvalue has several modes, that vector has only one combination of
+    # them, and the others appear by rounding alone. The iteration is therefore repeated on the complement of the modes
+    # found so far, until the eigenvalues of that complement are larger than the k wanted ones.
     count = min(k + _MORE, size - 2)
     while count > 0:
         inverse = _Deflated(factors, shift, values, right, left)
