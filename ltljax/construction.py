@@ -261,17 +261,19 @@ def _choose_neighbours(
         topology = dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths)
         return topology, angles, report
 
+    places, reach = around, reach_of(topology.is_extrinsic)
     if chart is None or topology.is_extrinsic is not None:
         # Rows in space are chosen in the tangent planes they will be weighed in.
         normals = surface_normals(scheme, vertices, topology)
         frames, _ = vertex_frames(vertices, normals, topology)
-        around = places_in(scheme, topology, vertices, normals, frames, chart_directions)
-        nearest = reach_of(topology.is_extrinsic)(np.arange(mesh.num_vertices), 1)
+        places = places_in(scheme, topology, vertices, normals, frames, chart_directions)
+        reach = reach_along(rings, places, charts, topology.is_extrinsic)
+        nearest = reach(np.arange(mesh.num_vertices), 1)
     topology, report = _choose_diffusion(
         scheme,
         topology,
-        around,
-        reach_of(topology.is_extrinsic),
+        places,
+        reach,
         nearest,
         chart,
         watch("choosing the neighbours of the Laplacian"),

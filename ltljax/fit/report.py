@@ -131,7 +131,8 @@ def _flat(tree: Any) -> np.ndarray:
 def _sentence(names: tuple[str, ...], direction: np.ndarray, share: float, verb: str, told: str) -> str:
     """What a direction (n,) of relative changes does to the predictions, a share of their spread when of length one."""
     largest = np.abs(direction).max()
-    # Of several that change as much the first one grows, whatever rounding makes of them.
+    # The sign is chosen so that the first of the largest changes is an increase. If only the largest one counted,
+    # rounding would decide between equal changes.
     first = np.flatnonzero(np.abs(direction) > 0.9 * largest)[0]
     change = direction / largest * np.sign(direction[first])
     parts = [f"{name} {10 * c:+.2g} %" for name, c in zip(names, change, strict=True) if abs(c) > 0.05]

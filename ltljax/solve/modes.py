@@ -107,8 +107,9 @@ def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, 
     )
     size = matrix.shape[0]
     values, right, left = np.zeros(0), np.zeros((size, 0)), np.zeros((size, 0))
-    # The iteration starts from one vector, and of an eigenvalue with several modes it sees the others by rounding only.
-    # So it is run again without what was found, until what is left lies above.
+    # The iteration starts from one vector. If an eigenvalue has several modes, that vector has only one combination of
+    # them, and the others appear by rounding alone. The iteration is therefore repeated on the complement of the modes
+    # found so far, until the eigenvalues of that complement are larger than the k wanted ones.
     count = min(k + _MORE, size - 2)
     while count > 0:
         inverse = _Deflated(factors, shift, values, right, left)
@@ -131,7 +132,7 @@ class _Deflated:
     """The inverse of a matrix less a shift, on the complement of the modes that were found.
 
     Args:
-        factors: of the shifted matrix.
+        factors: the sparse LU factors of the matrix less the shift.
         shift: what was subtracted.
         values: (n,) found eigenvalues.
         right: (V, n) their vectors.
