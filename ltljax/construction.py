@@ -222,8 +222,8 @@ def warn_of_coarse_mesh(topology: Topology, normals: np.ndarray, scheme: Scheme,
     if smooth.size and (most := np.quantile(smooth, 1 - _COARSE_SHARE)) > _COARSE:
         warnings.warn(
             f"The mesh is coarse against its curvature: at {_COARSE_SHARE:.0%} of the vertices normals turn by more "
-            f"than {np.degrees(most):.0f} degrees over the neighbours of one fit. Where these are more than "
-            f"{np.degrees(_COARSE):.0f} degrees ltl.Monotone() is as accurate or more: use it, or subdivide the mesh.",
+            f"than {np.degrees(most):.0f} degrees over the neighbours of one fit. Beyond {np.degrees(_COARSE):.0f} "
+            "degrees ltl.Monotone() was as accurate or more for Poisson's equation: use it, or subdivide the mesh.",
             CoarseMeshWarning,
             stacklevel=stacklevel + 1,
         )

@@ -50,6 +50,7 @@ class EllipticStencil(eqx.Module):
         residual: (V,) the largest error of a moment of each row, relative, zero to rounding where it is consistent.
         flux_weights: (B, 2) what a unit flux through each side of a boundary vertex adds to the operator there.
         mean_diffusion: half the trace of D in the tangent plane, its mean over the vertices.
+        width: the spectral width, see `spectral_width`.
     """
 
     table: Table
@@ -60,6 +61,7 @@ class EllipticStencil(eqx.Module):
     residual: Float[AnyArray, " V"]
     flux_weights: Float[AnyArray, "B 2"]
     mean_diffusion: Float[AnyArray, ""]
+    width: Float[AnyArray, ""]
 
     def __call__(self, u: Float[AnyArray, "V *S"]) -> Float[Array, "V *S"]:
         """The operator applied to u."""
@@ -74,9 +76,12 @@ class EllipticStencil(eqx.Module):
         return 2 * jnp.max(slot_sum(self.table, self.weights))
 
     def spectral_width(self) -> Float[Array, ""]:
-        """How far eigenvalues lie off the real axis, as `ltl.spectral_width` has it: half the mean row sum, which is
-        more than the stencils of random points have."""
-        return jnp.mean(slot_sum(self.table, self.weights)) / 2
+        """How far eigenvalues lie off the real axis, in the sense of `ltl.spectral_width`.
+
+        An estimate from above: the mean row sum, for rows that are not symmetric, together with the largest value of
+        b . D^-1 b, for the drift; at most the spectral bound, which always suffices.
+        """
+        return jnp.asarray(self.width)
 
     def with_coefficients(
         self,
@@ -89,17 +94,20 @@ class EllipticStencil(eqx.Module):
 
         As good as the neighbours suit the new coefficients; ``residual`` tells.
         """
+        frames = surface.geometry.frames
+        advection = _largest_advection(_targets(frames, diffusion, drift))
         if divergence_form:
             drift = _with_divergence(surface, diffusion, drift)
-        targets = _targets(surface.geometry.frames, diffusion, drift)
+        targets = _targets(frames, diffusion, drift)
         around = places(surface.scheme, surface.topology, surface.geometry)
         weights, residual, left = _rows(
             around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows
         )
         flux = _flux_weights(surface.topology, surface.geometry, targets, left, self.table, self.cotangent_rows)
-        found = (weights, reverse_weights(self.table, weights), residual, flux, _mean_diffusion(targets))
-        found = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), found)
-        return EllipticStencil(self.table, self.paths, self.cotangent_rows, *found)
+        width = jax.lax.stop_gradient(_spectral_width(self.table, weights, advection))  # whose roots have none
+        numbers = (weights, reverse_weights(self.table, weights), residual, flux, _mean_diffusion(targets), width)
+        numbers = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), numbers)
+        return EllipticStencil(self.table, self.paths, self.cotangent_rows, *numbers)
 
 
 def elliptic_stencil(
@@ -141,10 +149,12 @@ def elliptic_stencil(
         )
     topology, geometry = jax.tree.map(_on_host, (surface.topology, surface.geometry))
     around, kinds = places(surface.scheme, topology, geometry), topology.kinds
-    if divergence_form:
-        drift = _with_divergence(surface, diffusion, drift)
+    tensor, frames = _checked(diffusion, geometry.frames), geometry.frames
     drift = None if drift is None else np.asarray(drift, np.float64)
-    targets = _targets(geometry.frames, _checked(diffusion, geometry.frames), drift)
+    advection = _largest_advection(_targets(frames, tensor, drift))
+    if divergence_form:
+        drift = np.asarray(_with_divergence(surface, diffusion, drift), np.float64)
+    targets = _targets(frames, tensor, drift)
     reach = reach_along(
         one_rings(topology.faces, surface.num_vertices),
         around,
@@ -172,10 +182,11 @@ def elliptic_stencil(
     table = reversible(table)
     weights, residual, left = _rows(around, kinds, targets, table, paths, cotangent_rows)
     flux = _flux_weights(topology, geometry, targets, left, table, cotangent_rows)
-    found = (weights, reverse_weights(table, weights), residual, flux, _mean_diffusion(targets))
-    found = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), found)
+    width = _spectral_width(table, weights, advection)
+    numbers = (weights, reverse_weights(table, weights), residual, flux, _mean_diffusion(targets), width)
+    numbers = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), numbers)
     table, paths, cotangent_rows = jax.tree.map(jnp.asarray, (table, paths, cotangent_rows))
-    return EllipticStencil(table, paths, cotangent_rows, *found)
+    return EllipticStencil(table, paths, cotangent_rows, *numbers)
 
 
 def direction_tensor(
@@ -261,6 +272,27 @@ def _targets(frames: AnyArray, diffusion: AnyArray | float, drift: AnyArray | No
 
 def _mean_diffusion(targets: AnyArray) -> AnyArray:
     return targets.__array_namespace__().asarray((targets[0, 3] + targets[0, 4]).mean() / 4)
+
+
+def _largest_advection(targets: AnyArray) -> AnyArray:
+    """The largest b . D^-1 b over the surface, infinite where there is drift without diffusion.
+
+    For a drift b without divergence, <u, b . grad u> is imaginary and its square at most b . D^-1 b times the real
+    number <grad u, D grad u>, for any u of norm one.
+    """
+    xp = targets.__array_namespace__()
+    x, y, cross, xx, yy = targets[0, 0], targets[0, 1], targets[0, 2] / 2, targets[0, 3] / 2, targets[0, 4] / 2
+    across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
+    determinant = xx * yy - cross**2
+    is_regular = determinant > xp.finfo(targets.dtype).eps * (xx + yy) ** 2
+    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1), xp.inf)
+    return xp.asarray(xp.max(xp.where(x**2 + y**2 > 0, ratio, 0)))
+
+
+def _spectral_width(table: Table, weights: PerBlock, advection: AnyArray) -> AnyArray:
+    xp = advection.__array_namespace__()
+    sums = slot_sum(table, weights)
+    return xp.asarray(xp.minimum(2 * xp.max(sums), (xp.sqrt(xp.mean(sums)) + xp.sqrt(advection)) ** 2))
 
 
 def _on_host(leaf: AnyArray) -> np.ndarray:

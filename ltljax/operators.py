@@ -24,6 +24,8 @@ _DENSE = 300
 # Products from which the rim of a spectrum is estimated, and what the estimate is multiplied with.
 _PRODUCTS = 60
 _MARGIN = 1.5
+# On larger surfaces the vectors of the products would take more memory than the tables do.
+_MOST_MEASURED = 250_000
 
 
 @on_device
@@ -144,8 +146,10 @@ def weighted_laplacian(
 
     The arithmetic mean serves a smooth g. The harmonic mean, ``2 g_k g_v / (g_k + g_v)``, serves a g that jumps. It is
     that of two conductors in a row, so that nothing flows to where g is zero: a wall of such vertices keeps its two
-    sides apart, but for the few rows that reach over two rings where it is one vertex wide (none on icospheres, 2 of
-    1,182 beside a wall on a jittered sphere).
+    sides apart if it is two vertices wide. Through one that is a single vertex wide a few rows reach that use two rings
+    (none on icospheres, 2 of 1,182 beside a wall on a jittered sphere).
+
+    A g that is zero or less counts as zero in the harmonic mean, and has no derivative there.
 
     Of the Laplacian's order where g is smooth; with ``Monotone`` and g >= 0 the weights stay non-negative and the
     maximum principle holds. On a boundary, for fields whose normal derivative vanishes. g may depend on u, which makes
@@ -172,17 +176,17 @@ def weighted_laplacian(
         g = conductivity.reshape(-1, *(1,) * (u.ndim - 1))
         return _divergence_in_frame(surface, g * x, g * y)
     rises = differences(table, conductivity)
-    of_ends = _harmonic if mean == "harmonic" else lambda here, rise: here + rise / 2
+    of_ends = _harmonic if mean == "harmonic" else lambda first, rise: first + rise / 2
     means = table.each(lambda block, rise: of_ends(block.centre(conductivity)[None], rise), rises)
     return difference_sum(table, tuple(w * g for w, g in zip(weights, means, strict=True)), u)
 
 
-def _harmonic(here: Array, rise: Array) -> Array:
-    """The harmonic mean of what is here and what is higher by a rise; zero where either is zero or less."""
-    there = here + rise
-    are_positive = (here > 0) & (there > 0)
-    total = jnp.where(are_positive, here + there, 1)
-    return jnp.where(are_positive, 2 * (here / total) * there, 0)
+def _harmonic(first: Array, rise: Array) -> Array:
+    """The harmonic mean of two numbers, the second larger by the rise; zero where either is zero or less."""
+    second = first + rise
+    are_positive = (first > 0) & (second > 0)
+    total = jnp.where(are_positive, first + second, 1)
+    return jnp.where(are_positive, 2 * (first / total) * second, 0)
 
 
 @on_device
@@ -296,13 +300,14 @@ def spectral_width(surface: Surface) -> Float[Array, ""]:
     Rows of the Laplacian are not symmetric where a mesh is not. Explicit steps of length dt have to be stable inside
     this parabola, so that the number of their stages follows from ``dt * chi`` too.
 
-    It is measured once for each surface (host), by Arnoldi iteration, whose first eigenvalues are those at the rim of
-    the spectrum, and half as much again is added. Where a JAX transformation is tracing a surface that was not
-    measured before, it is half the mean row sum, which is more than random points need.
+    It is an estimate, no bound: measured once for each surface (host) by Arnoldi iteration, whose first eigenvalues are
+    those at the rim of the spectrum, with half as much again added. On a surface of more than 250,000 vertices, and
+    where a JAX transformation is tracing a surface that was not measured before, it is half the mean row sum, which is
+    several times what random points need.
     """
     if surface.geometry.spectral_width is not None:
         return surface.geometry.spectral_width
-    if not surface.is_traced:
+    if not surface.is_traced and surface.num_vertices <= _MOST_MEASURED:
         with jax.ensure_compile_time_eval():
             width = surface.remembered("spectral width", lambda: _measured_width(surface))
         return jnp.asarray(width, surface.dtype)

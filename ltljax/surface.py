@@ -269,8 +269,8 @@ _REMEMBERED: dict[int, dict[str, Any]] = {}
 
 def _is_in_range(geometry: Geometry) -> bool:
     """Whether all numbers are finite, and those that go with the squared length large enough to have all digits."""
-    # Rows of several blocks together: all that one block has of them may be zero.
-    squares = (geometry.laplacian_weights, *(geometry.hessian_weights or ()), geometry.vertex_areas)
+    # All blocks and components of a kind together, as all numbers of one of them may be zero.
+    squares = (geometry.laplacian_weights, geometry.hessian_weights, geometry.vertex_areas)
     is_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(geometry))
     largest = [
         max(np.abs(leaf).max(initial=0) for leaf in jax.tree.leaves(group)) for group in squares if group is not None

@@ -163,3 +163,27 @@ def test_what_does_not_fit_is_refused():
         ltl.solve(ltl.Diffusion(boundary=ltl.Dirichlet(0.0, species=0)), SURFACE, two[:, 0], 0.1)
     with pytest.raises(ValueError, match="solve for each of them by itself"):
         ltl.poisson(SURFACE, two, ltl.Dirichlet(0.0, species=0))
+
+
+def test_the_steady_state_of_a_diffusivity_that_varies_is_found_in_few_steps_and_has_derivatives_where_it_is_held():
+    surface = ltl.Surface.from_mesh(ltl.shapes.square(n=16))
+    x = surface.vertices[:, 0]
+    ends = ltl.Dirichlet(lambda t, x: x[:, 0], where=lambda x: (x[:, 0] < 1e-9) | (x[:, 0] > 1 - 1e-9))
+
+    def state(scale):
+        equation = ltl.Diffusion(jnp.exp(scale * x), boundary=ends)
+        return ltl.steady_state(equation, surface, jnp.zeros_like(x))
+
+    # (exp(s x) u')' = 0.
+    exact = (1 - jnp.exp(-3 * x)) / (1 - jnp.exp(-3.0))
+    np.testing.assert_allclose(state(3.0), exact, atol=2e-3)
+    middle = int(jnp.argmin(jnp.linalg.norm(surface.vertices - jnp.array([[0.5, 0.5, 0]]), axis=1)))
+    slope = jax.grad(lambda s: state(s)[middle])(3.0)
+    assert float(slope) == pytest.approx(float(state(3.01)[middle] - state(2.99)[middle]) / 0.02, rel=1e-3)
+
+
+def test_a_single_rate_may_be_a_plain_number():
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    u0 = jnp.ones((surface.num_vertices, 1))
+    growing = ltl.ReactionDiffusion([1.0], lambda species, params: 1.0)
+    np.testing.assert_allclose(ltl.solve(growing, surface, u0, 0.5).u_end, 1.5, rtol=1e-5)

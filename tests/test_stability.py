@@ -135,3 +135,61 @@ def test_a_hundred_random_spheres_keep_the_range_of_heat_or_refuse(dt):
         for solver in (ltl.RKL2(), ltl.RKL1()):
             found = largest(surface, noise(surface, seed), dt, solver)
             assert found is None or found <= RANGE
+
+
+@pytest.mark.parametrize("solver", [ltl.RKL1(), ltl.RKL2()], ids=["RKL1", "RKL2"])
+@pytest.mark.parametrize("diffusion", [0.0, 0.01, 1.0])
+def test_drift_with_a_flow_stays_in_the_range_of_its_start(solver, diffusion):
+    surface = ltl.Surface.from_mesh(ltl.shapes.torus(n_major=28, n_minor=14))
+    x, y, z = surface.vertices.T
+    stencil = ltl.elliptic_stencil(surface, diffusion, jnp.stack([-y, x, 0 * z], axis=1))
+    assert _largest_ratio(stencil) <= float(stencil.spectral_width())
+    u0 = noise(surface, 0)
+    for steps, dt in ((100, 20 / float(stencil.spectral_bound())), (30, 200 / float(stencil.spectral_bound()))):
+        end = ltl.solve(ltl.Diffusion(stencil), surface, u0, steps * dt, dt=dt, solver=solver).u_end
+        assert float(jnp.max(jnp.abs(end))) <= RANGE * float(jnp.max(jnp.abs(u0)))
+
+
+def test_the_width_of_a_stencil_is_safe_where_diffusion_turns_and_varies():
+    for mesh in (ltl.shapes.torus(n_major=28, n_minor=14), ltl.shapes.random_sphere(500, seed=1)):
+        surface = ltl.Surface.from_mesh(mesh)
+        x, y, z = surface.vertices.T
+        turning = ltl.direction_tensor(surface, jnp.stack([-y, x, 0 * z], axis=1), 1.0, 0.01)
+        for tensor in (turning, 0.1 + jnp.exp(-10 * (x - 0.5) ** 2), jnp.where(x > 0, 1.0, 1e-3)):
+            stencil = ltl.elliptic_stencil(surface, tensor)
+            assert _largest_ratio(stencil) <= float(stencil.spectral_width())
+            again = stencil.with_coefficients(surface, tensor)
+            np.testing.assert_allclose(again.spectral_width(), stencil.spectral_width(), rtol=1e-6)
+
+
+def _largest_ratio(stencil):
+    values = scipy.linalg.eigvals(stencil.matrix().todense())
+    values = values[values.real < -1e-9 * np.abs(values).max()]
+    return np.max(values.imag**2 / -values.real)
+
+
+@pytest.mark.parametrize("scheme", [ltl.Polynomial(3), ltl.Paper()], ids=["Polynomial", "Paper"])
+def test_a_source_that_starts_at_zero_is_no_overflow(scheme):
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), scheme=scheme)
+    equation = ltl.Diffusion(1.0, source=lambda t, x: t * x[:, 2])
+    end = ltl.solve(equation, surface, jnp.zeros(surface.num_vertices), 0.1, rtol=1e-6).u_end
+    # Of u' = -2 u + t: t / 2 - (1 - exp(-2 t)) / 4.
+    assert float(jnp.max(end)) == pytest.approx(0.05 - (1 - np.exp(-0.2)) / 4, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_the_bound_of_reactions_that_differ_from_vertex_to_vertex_holds(count):
+    # At one vertex the first species drives the second, at another the second the first: diffusion couples the two.
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
+    side = jnp.arange(surface.num_vertices) % 2
+    strength = 50.0
+
+    def rates(species, side):
+        first, second, *rest = species
+        return (strength * side * second, strength * (1 - side) * first, *(0 * u for u in rest))
+
+    equation = ltl.ReactionDiffusion([1.0] * count, rates, side.astype(float))
+    u, now = jnp.ones((surface.num_vertices, count)), jnp.zeros(())
+    jacobian = jax.jacobian(lambda u: equation.rate(now, surface, u))(u).reshape(u.size, u.size)
+    largest = np.abs(np.linalg.eigvals(jacobian)).max()
+    assert largest <= float(equation.spectral_bound(now, surface, u))

@@ -6,6 +6,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.spatial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,6 +85,16 @@ def test_the_unit_of_length_changes_units_only(scheme, dtype, share):
 def test_lengths_whose_weights_leave_the_float_type_are_refused(factor):
     with pytest.raises(ValueError, match="leave the range of float32"):
         ltl.Surface.from_mesh(MESH.scaled(factor), dtype=jnp.float32)
+
+
+def test_a_mesh_is_not_refused_because_one_block_of_its_weights_is_zero():
+    # Of the Hessian's weights whole blocks may vanish, where rows of one length are few.
+    points = np.random.default_rng(0).random((100, 2))
+    points = np.concatenate([points, [[0, 0], [1, 0], [0, 1], [1, 1]]])
+    mesh = ltl.Mesh(
+        np.column_stack([points, np.zeros(len(points))]), scipy.spatial.Delaunay(points).simplices, repair=True
+    )
+    assert ltl.Surface.from_mesh(mesh).num_vertices == 104
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1.0, 1e9])

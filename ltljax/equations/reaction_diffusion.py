@@ -14,8 +14,8 @@ from .equation import Equation
 from .kinetics import Kinetics
 from .spreads import Spread, as_spreads, mean_diffusivities, spread_bound, spread_rate, spread_width
 
-# A spectral radius is estimated from a power whose exponent is two to this one.
-_SQUARINGS = 5
+# A spectral radius is estimated from the power of this many squarings.
+_SQUARINGS = 6
 
 
 class ReactionDiffusion(Equation):
@@ -87,10 +87,10 @@ class ReactionDiffusion(Equation):
         return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The diffusion's bound plus the largest one of the reaction's Jacobian over the surface, whatever the units of
-        the species."""
+        """The diffusion's bound plus the spectral radius of the reaction's largest derivatives, in any units of the
+        species."""
         self._check(u)
-        reaction = jnp.max(_spectral_radius(jnp.abs(self._jacobian(u))))
+        reaction = _spectral_radius(jnp.max(jnp.abs(self._jacobian(u)), axis=0))
         return spread_bound(surface, self.diffusivity, self.boundary, t, u) + reaction
 
     def spectral_width(self, t, surface: Surface, u):
@@ -103,7 +103,7 @@ class ReactionDiffusion(Equation):
         turning = jnp.sqrt(jnp.maximum(-jacobian * jnp.swapaxes(jacobian, 1, 2), 0))
         if u.shape[1] > 2:
             turning = jnp.abs(jacobian) * (1 - jnp.eye(u.shape[1], dtype=u.dtype))[None]
-        return spread_width(surface, self.diffusivity, u) + 2 * jnp.max(_spectral_radius(turning))
+        return spread_width(surface, self.diffusivity, u) + 2 * _spectral_radius(jnp.max(turning, axis=0))
 
     def _jacobian(self, u: Array) -> Array:
         """The derivatives of the reaction's rates at every vertex, (V, S, S); what bounds steps has no derivatives."""
@@ -118,19 +118,19 @@ class ReactionDiffusion(Equation):
             )
 
 
-def _spectral_radius(a: Float[Array, "V S S"]) -> Float[Array, " V"]:
-    """The spectral radius of non-negative matrices, which a change of the species' units leaves as it is; of more than
+def _spectral_radius(a: Float[Array, "S S"]) -> Float[Array, ""]:
+    """The spectral radius of a non-negative matrix, which a change of the species' units leaves as it is; of more than
     two species a bound that such a change hardly changes."""
-    if a.shape[1] == 1:
-        return a[:, 0, 0]
-    if a.shape[1] == 2:
-        half = (a[:, 0, 0] - a[:, 1, 1]) / 2
-        across = jnp.sqrt(a[:, 0, 1]) * jnp.sqrt(a[:, 1, 0])
-        return (a[:, 0, 0] + a[:, 1, 1]) / 2 + jnp.hypot(half, across)
+    if len(a) == 1:
+        return a[0, 0]
+    if len(a) == 2:
+        half = (a[0, 0] - a[1, 1]) / 2
+        across = jnp.sqrt(a[0, 1]) * jnp.sqrt(a[1, 0])
+        return (a[0, 0] + a[1, 1]) / 2 + jnp.hypot(half, across)
     # The norm of the power 2^n is at least the radius to that power.
-    logarithm = jnp.zeros(len(a), a.dtype)
-    for _ in range(_SQUARINGS + 1):
-        norm = jnp.maximum(jnp.max(jnp.sum(a, axis=2), axis=1), jnp.finfo(a.dtype).tiny)
-        a, logarithm = a / norm[:, None, None], logarithm + jnp.log(norm)
-        a, logarithm = jnp.einsum("vij,vjk->vik", a, a), 2 * logarithm
-    return jnp.exp(logarithm / 2 ** (_SQUARINGS + 1))
+    logarithm = jnp.zeros((), a.dtype)
+    for squaring in range(_SQUARINGS + 1):
+        a = a @ a if squaring else a
+        norm = jnp.maximum(jnp.max(jnp.sum(a, axis=1)), jnp.finfo(a.dtype).tiny)
+        a, logarithm = a / norm, 2 * logarithm + jnp.log(norm)
+    return jnp.exp(logarithm / 2**_SQUARINGS)

@@ -29,9 +29,8 @@ def as_spreads(given: Any) -> Spreads:
     if not isinstance(given, tuple | list):
         return jnp.asarray(given, jnp.result_type(float))
     each = tuple(d if isinstance(d, EllipticStencil) else jnp.asarray(d, jnp.result_type(float)) for d in given)
-    if all(not isinstance(d, EllipticStencil) and d.ndim == 0 for d in each):
-        return jnp.stack(cast(tuple[Array, ...], each))
-    return each
+    is_numbers = all(not isinstance(d, EllipticStencil) and d.ndim == 0 for d in each)
+    return jnp.stack(cast(tuple[Array, ...], each)) if is_numbers else each
 
 
 def are_numbers(spreads: Spreads, u: Float[Array, "V *S"]) -> bool:
@@ -65,7 +64,7 @@ def of_each(spreads: Spreads, u: Float[Array, "V *S"]) -> tuple[Spread, ...]:
 def spread_rate(
     surface: Surface, spreads: Spreads, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "V *S"]:
-    """What diffusion makes of a state that keeps the conditions, with the fluxes they let through."""
+    """The rate of change by diffusion of a state that keeps the conditions, with the fluxes they let through."""
     if are_numbers(spreads, u):
         numbers = jnp.broadcast_to(jnp.asarray(spreads, u.dtype), u.shape[1:])
         return numbers[None] * bounds.bounded_laplacian(surface, conditions, t, u)
@@ -126,8 +125,8 @@ def _flux_weights(surface: Surface, spread: Spread) -> Float[Array, "B 2"] | Non
     if isinstance(spread, EllipticStencil):
         return spread.flux_weights
     weights = surface.geometry.flux_weights
-    here = jnp.broadcast_to(spread, (surface.num_vertices,))[surface.topology.boundary]
-    return None if weights is None else here.astype(weights.dtype)[:, None] * weights
+    at_boundary = jnp.broadcast_to(spread, (surface.num_vertices,))[surface.topology.boundary]
+    return None if weights is None else at_boundary.astype(weights.dtype)[:, None] * weights
 
 
 def _largest(numbers: Array) -> Array:

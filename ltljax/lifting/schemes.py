@@ -75,10 +75,9 @@ class Polynomial:
     `CoarseMeshWarning` says so. Degree 3 has twice the error of `Monotone` there at every size: it is for gradients and
     curvature.
 
-    If a fit would cross a
-    crease it is made in the intrinsic chart of the vertex, which is exact where both sides are flat and first
-    order where they are curved. Weights of both signs: there is no maximum principle, and on bad meshes the Laplacian
-    can have growing modes; `solve` looks for them before it steps.
+    A fit that would cross a crease is made in the intrinsic chart of the vertex, which is exact where both sides are
+    flat and first order where they are curved. Weights have both signs, so that there is no maximum principle, and on
+    bad meshes the Laplacian can have growing modes; `solve` looks for them before it steps.
 
     Attributes:
         degree: 3 or 4.

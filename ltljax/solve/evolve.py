@@ -273,10 +273,6 @@ def solve(
         raise TypeError(
             f"Expected as preconditioner what ltl.multigrid(surface) returned, found {type(preconditioner).__name__}."
         )
-    if not surface.is_traced:
-        surface = eqx.tree_at(
-            lambda s: s.geometry.spectral_width, surface, spectral_width(surface), is_leaf=lambda leaf: leaf is None
-        )
     # As arrays, so that other tolerances need no compiling.
     relative = jnp.asarray(rtol, surface.dtype)
     absolute = None if atol is None else jnp.asarray(atol, surface.dtype)
@@ -292,6 +288,10 @@ def solve(
         why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
         checks.step(equation, surface, u0, t0, dt, method)
+    if not surface.is_traced and not isinstance(method, ImplicitRungeKutta | SBDF2):
+        surface = eqx.tree_at(
+            lambda s: s.geometry.spectral_width, surface, spectral_width(surface), is_leaf=lambda leaf: leaf is None
+        )
     name = f"{type(method if solver is None else solver).__name__}: {why}"
     grid = _grid(t0, t1, times, dt)
     is_taped = (
@@ -537,8 +537,10 @@ def _largest(surface: Surface, u0: Array, change: Array) -> Array:
     largest = jnp.asarray(_ALMOST_ALL * jnp.finfo(u0.dtype).max, u0.dtype)
     if isinstance(surface.scheme, Monotone):
         return largest
-    # Growing modes get there by ever shorter steps: what grew beyond this is on its way.
-    return jnp.minimum(largest, _GROWN * jnp.maximum(jnp.max(jnp.abs(u0)), jnp.max(jnp.abs(change))))
+    # Growing modes get there by ever shorter steps: what grew beyond this is on its way. What begins with nothing has
+    # no size to compare with.
+    size = jnp.maximum(jnp.max(jnp.abs(u0)), jnp.max(jnp.abs(change)))
+    return jnp.where(size > 0, jnp.minimum(largest, _GROWN * size), largest)
 
 
 def _as_held(equation: Equation, surface: Surface, ts: Array, us: Array, t_end: Array, u_end: Array, *rest) -> Solution:

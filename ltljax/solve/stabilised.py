@@ -14,19 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-# Numbers of stages on offer, about a fifth apart, so at most that much of a step is wasted; odd, as even ones do not
-# damp the stiffest modes.
+# The numbers of stages on offer are about a fifth apart, so that at most a fifth of the stages is wasted. They are odd,
+# because an even number does not damp the stiffest modes.
 STAGES = np.unique(np.round(np.geomspace(3, 257, 28)).astype(int) // 2 * 2 + 1)
 
 FEWEST = int(STAGES[0])
 
-# How far the stages are damped: stage polynomials are taken about the point cosh(angle), and at the angle zero they are
-# those of the papers. Fewer stages than these angles over the last one gain nothing from more damping.
+# The damping on offer. Legendre's polynomials are taken about the point cosh(angle): at the angle zero these are the
+# stages of the papers, and the larger the angle, the stronger the damping.
 _ANGLES = np.append(0, np.geomspace(1.5 / STAGES[-1], 2.5, 17))
 
-
-# A step is nonsense if after it the rate would change the state by so many times its size.
-_NONSENSE = 10
+# A step has failed if the rate after it would change the state by more than so many times its size.
+_LARGEST_CHANGE = 10
 
 
 def bound_of_equation(t, u, args):
@@ -42,12 +41,12 @@ def width_of_equation(t, u, args):
 
 
 class Plan(NamedTuple):
-    """The stages of a step. Increments are over the state at its start, and the first is of stage one.
+    """The stages of a step. Increments are differences from the state at its start; the first one is of stage one.
 
     Attributes:
-        stages: their number.
+        stages: the number of stages.
         dt: the length of the step.
-        is_stable: whether that is the length asked for.
+        is_stable: whether that is the length that was asked for; if not, it is the longest stable one.
         mu: (257 + 1,) of the last increment; entry j belongs to stage j, here and below.
         nu: of the increment before.
         mu_rate: of the rate at the last increment, over dt.
@@ -70,7 +69,7 @@ class Plan(NamedTuple):
 
     def time(self, t0: ArrayLike, j: Array) -> Array:
         """When the rate is taken from which increment j is made."""
-        # Beyond the last stage, where runs in a batch with longer steps get, within the step.
+        # In a batch the loop goes on beyond the last stage of a run for the sake of others, with times within its step.
         return jnp.asarray(t0) + self.c[jnp.minimum(j, self.stages) - 1] * self.dt
 
     def stage(self, j: Array, before: Array, last: Array, rate: Array, rate0: Array) -> Array:
@@ -79,21 +78,21 @@ class Plan(NamedTuple):
         return mu * last + nu * before + self.dt * (mu_rate * rate + gamma_rate * rate0)
 
     def coefficients(self, j: Array) -> tuple[Array, Array, Array, Array]:
-        """Those of increment j; beyond the last stage those of an increment like the last."""
+        """The coefficients of increment j; beyond the last stage those that repeat the last increment."""
         is_there, row = j <= self.stages, (self.mu[j], self.nu[j], self.mu_rate[j], self.gamma_rate[j])
         return cast(Any, tuple(jnp.where(is_there, x, rest) for x, rest in zip(row, (1, 0, 0, 0), strict=True)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Family:
-    """Stages on offer, M in all: of each number of them several, from no damping to much.
+    """The members to choose from, M in all: for each number of stages several, from no damping to much.
 
-    Those of a step of length dt are stable where eigenvalues x + iy, of negative real part, satisfy
+    The stages of a step of length dt are stable where eigenvalues x + iy, of negative real part, satisfy
     ``dt y^2 <= parabola |x| (1 - dt |x| / reach)``.
 
     Attributes:
-        stages: (M,) their number, ascending.
-        level: (M,) how much they are damped, as a row of ``rows``.
+        stages: (M,) the number of stages, ascending.
+        level: (M,) which of the N dampings they have.
         scale: (M,) what multiplies the rates.
         reach: (M,) how far along the negative real axis they are stable.
         parabola: (M,) how wide they are stable close to the origin.
@@ -109,7 +108,7 @@ class Family:
     rows: np.ndarray
 
     def inverse_lengths(self, extent: Float[Array, "2"]) -> Float[Array, " M"]:
-        """One over the longest stable step of each, where eigenvalues have such a bound and width."""
+        """One over the longest stable step of each member, where eigenvalues have such a bound and width."""
         bound, width = extent
         return bound / jnp.asarray(self.reach, bound.dtype) + width / jnp.asarray(self.parabola, bound.dtype)
 
@@ -193,13 +192,14 @@ class Stabilised(diffrax.AbstractAdaptiveSolver):
 
 
 def is_sensible(dt: Array, y0: Array, increment: Array, rate0: Array, rate1: Array) -> Bool[Array, ""]:
-    """Whether a step is no nonsense, as one is that changes the state by half of it and more, and after which the rate
-    would change it by ten times as much again, though it would not have before.
+    """Whether a step can be believed.
 
-    So it is in every species, by its largest values. What is unstable grows where it is seen in a rate first.
+    It cannot if it changed a species by more than half of its size, increased its rate, and the new rate would change
+    the species in one more step by ten times its size. Sizes are largest magnitudes over the surface. What is unstable
+    is seen in the rate first, where the stiffest modes weigh the most.
     """
     start, change, first, last = (jnp.max(jnp.abs(x), axis=0) for x in (y0, increment, rate0, rate1))
-    grows = (last > first) & (dt * last > _NONSENSE * (start + change))
+    grows = (last > first) & (dt * last > _LARGEST_CHANGE * (start + change))
     return ~jnp.any((start > 0) & (change > start / 2) & grows)
 
 

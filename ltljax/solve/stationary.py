@@ -17,9 +17,9 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..equations import Diffusion, Equation
+from ..equations import Diffusion, Equation, ReactionDiffusion
 from ..equations import boundary as bounds
-from ..equations.spreads import are_numbers
+from ..equations.spreads import are_numbers, spread_bound
 from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..operators import spectral_bound
 from ..surface import Surface
@@ -278,7 +278,8 @@ def steady_state(
     Of any other equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
     rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
     state is steady, then takes Newton's last step (for `Diffusion` the linear system). Differentiable in reverse and
-    forward mode by the implicit function theorem, in everything but u0.
+    forward mode by the implicit function theorem, in everything but u0. Where the state is determined by u0 only up to
+    a constant, which is so for a diffusivity that varies where nothing holds or absorbs, it has no derivatives.
 
     Args:
         equation: the equation.
@@ -376,7 +377,11 @@ def _newton(equation, surface, u0, time, multigrid, tolerance):
     diffusivities = equation.diffusivities(u0)
     flat = diffusivities.reshape(-1)
     stiffness = equation.spectral_bound(time, surface, u0)
-    reaction = jnp.maximum(stiffness - jnp.max(flat) * spectral_bound(surface), 0)
+    if isinstance(equation, Diffusion | ReactionDiffusion):
+        diffusion = spread_bound(surface, equation.diffusivity, equation.conditions, time, u0)
+    else:
+        diffusion = jnp.max(flat) * spectral_bound(surface)
+    reaction = jnp.maximum(stiffness - diffusion, 0)
 
     is_held = bounds.held_values(surface, equation.conditions, u0)
 
