@@ -21,6 +21,8 @@ from ..tables import AnyArray
 _ROUNDING = 1e-12
 # Two paths come from one point if the cosine of the angle between them is larger than this.
 _ALIKE = 0.5
+# Angles that differ by less, in radians, are the same.
+_SLACK = 1e-9
 # At a boundary vertex no angle goes around: it is reduced by so many radians, never reached.
 _NEVER_AROUND = 1e3
 
@@ -276,7 +278,8 @@ def _backward(windows: _Windows, which: np.ndarray, front: _Front) -> Complex[np
     ends, places, facing = windows.ends[:, which], windows.places[:, which], windows.facing[:, which]
     along = places[1] - places[0]
     along = along / np.maximum(np.abs(along), np.finfo(float).tiny)
-    turn = np.mod((facing - front.direction[ends]) * np.array([[1], [-1]]), windows.angle_sums[ends])
+    # A path along the edge between the two turns by nothing, and not by rounding less than once around.
+    turn = np.mod((facing - front.direction[ends]) * np.array([[1], [-1]]) + _SLACK, windows.angle_sums[ends]) - _SLACK
     return np.where(turn < np.pi, np.stack([along * np.exp(-1j * turn[0]), -along * np.exp(1j * turn[1])]), 0)
 
 
