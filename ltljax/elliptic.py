@@ -18,7 +18,7 @@ from .lifting.jets import operator_weights
 from .lifting.layout import PerBlock, Places, block_paths, rows_last
 from .lifting.schemes import Geometry, Topology, conormals_in_frame, flux_weights, places
 from .mesh import one_rings
-from .operators import gradient
+from .operators import MOST_MEASURED, gradient, measured_width
 from .progress import watched
 from .surface import Surface, on_device
 from .tables import (
@@ -78,8 +78,9 @@ class EllipticStencil(eqx.Module):
     def spectral_width(self) -> Float[Array, ""]:
         """How far eigenvalues lie off the real axis, in the sense of `ltl.spectral_width`.
 
-        An estimate from above: the mean row sum, for rows that are not symmetric, together with the largest value of
-        b . D^-1 b, for the drift; at most the spectral bound, which always suffices.
+        An estimate, and at most the spectral bound, which always suffices. What rows that are not symmetric contribute
+        is measured when the stencil is chosen, as for the Laplacian, and estimated from the row sums for other
+        coefficients; the drift contributes the largest value of b . D^-1 b. It has no derivatives.
         """
         return jnp.asarray(self.width)
 
@@ -104,7 +105,8 @@ class EllipticStencil(eqx.Module):
             around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows
         )
         flux = _flux_weights(surface.topology, surface.geometry, targets, left, self.table, self.cotangent_rows)
-        width = jax.lax.stop_gradient(_spectral_width(self.table, weights, advection))  # whose roots have none
+        # The square root has no derivative at zero.
+        width = jax.lax.stop_gradient(_spectral_width(self.table, weights, advection))
         numbers = (weights, reverse_weights(self.table, weights), residual, flux, _mean_diffusion(targets), width)
         numbers = jax.tree.map(lambda leaf: leaf.astype(surface.dtype), numbers)
         return EllipticStencil(self.table, self.paths, self.cotangent_rows, *numbers)
@@ -182,7 +184,10 @@ def elliptic_stencil(
     table = reversible(table)
     weights, residual, left = _rows(around, kinds, targets, table, paths, cotangent_rows)
     flux = _flux_weights(topology, geometry, targets, left, table, cotangent_rows)
-    width = _spectral_width(table, weights, advection)
+    measured = None
+    if surface.num_vertices <= MOST_MEASURED:
+        measured = measured_width(difference_matrix(table, weights), np.asarray(geometry.vertex_areas))
+    width = _spectral_width(table, weights, advection, measured)
     numbers = (weights, reverse_weights(table, weights), residual, flux, _mean_diffusion(targets), width)
     numbers = jax.tree.map(lambda leaf: jnp.asarray(leaf, surface.dtype), numbers)
     table, paths, cotangent_rows = jax.tree.map(jnp.asarray, (table, paths, cotangent_rows))
@@ -282,17 +287,25 @@ def _largest_advection(targets: AnyArray) -> AnyArray:
     """
     xp = targets.__array_namespace__()
     x, y, cross, xx, yy = targets[0, 0], targets[0, 1], targets[0, 2] / 2, targets[0, 3] / 2, targets[0, 4] / 2
-    across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
+    # In units in which D has the trace 2, so that no product leaves the range of the float type.
+    unit = (xx + yy) / 2
+    unit = xp.where(unit > 0, unit, 1)
+    xx, yy, cross = xx / unit, yy / unit, cross / unit
     determinant = xx * yy - cross**2
-    is_regular = determinant > xp.finfo(targets.dtype).eps * (xx + yy) ** 2
-    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1), xp.inf)
+    is_regular = determinant > 4 * xp.finfo(targets.dtype).eps
+    across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
+    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1) / unit, xp.inf)
     return xp.asarray(xp.max(xp.where(x**2 + y**2 > 0, ratio, 0)))
 
 
-def _spectral_width(table: Table, weights: PerBlock, advection: AnyArray) -> AnyArray:
+def _spectral_width(table: Table, weights: PerBlock, advection: AnyArray, measured: float | None = None) -> AnyArray:
     xp = advection.__array_namespace__()
     sums = slot_sum(table, weights)
-    return xp.asarray(xp.minimum(2 * xp.max(sums), (xp.sqrt(xp.mean(sums)) + xp.sqrt(advection)) ** 2))
+    if measured is None:
+        # The mean row sum, rows being weighted by their sums: where few rows are active they count.
+        share = sums / xp.maximum(xp.sum(sums), xp.finfo(sums.dtype).tiny)
+        measured = xp.sum(share * sums)
+    return xp.asarray(xp.minimum(2 * xp.max(sums), (xp.sqrt(measured) + xp.sqrt(advection)) ** 2))
 
 
 def _on_host(leaf: AnyArray) -> np.ndarray:

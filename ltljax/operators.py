@@ -25,7 +25,7 @@ _DENSE = 300
 _PRODUCTS = 60
 _MARGIN = 1.5
 # On larger surfaces the vectors of the products would take more memory than the tables do.
-_MOST_MEASURED = 250_000
+MOST_MEASURED = 250_000
 
 
 @on_device
@@ -146,8 +146,8 @@ def weighted_laplacian(
 
     The arithmetic mean serves a smooth g. The harmonic mean, ``2 g_k g_v / (g_k + g_v)``, serves a g that jumps. It is
     that of two conductors in a row, so that nothing flows to where g is zero: a wall of such vertices keeps its two
-    sides apart if it is two vertices wide. Through one that is a single vertex wide a few rows reach that use two rings
-    (none on icospheres, 2 of 1,182 beside a wall on a jittered sphere).
+    sides apart if it is two vertices wide. A few rows that use two rings reach through a wall one vertex wide (none on
+    icospheres, 2 of 1,182 beside a wall on a jittered sphere).
 
     A g that is zero or less counts as zero in the harmonic mean, and has no derivative there.
 
@@ -307,9 +307,11 @@ def spectral_width(surface: Surface) -> Float[Array, ""]:
     """
     if surface.geometry.spectral_width is not None:
         return surface.geometry.spectral_width
-    if not surface.is_traced and surface.num_vertices <= _MOST_MEASURED:
+    if not surface.is_traced and surface.num_vertices <= MOST_MEASURED:
         with jax.ensure_compile_time_eval():
-            width = surface.remembered("spectral width", lambda: _measured_width(surface))
+            width = surface.remembered(
+                "spectral width", lambda: measured_width(laplacian_matrix(surface), np.asarray(surface.vertex_areas))
+            )
         return jnp.asarray(width, surface.dtype)
     weights = surface.geometry.laplacian_weights
     if surface.topology.diffusion is None or weights is None:
@@ -317,23 +319,24 @@ def spectral_width(surface: Surface) -> Float[Array, ""]:
     return jnp.mean(slot_sum(surface.topology.diffusion, weights)) / 2
 
 
-def _measured_width(surface: Surface) -> float:
+def measured_width(operator: scipy.sparse.csr_array, vertex_areas: np.ndarray) -> float:
+    """The spectral width, as of `spectral_width`, of a matrix (V, V) on a surface with vertex areas (V,) (host)."""
     # In the inner product of the areas eigenvectors are nearly orthogonal.
-    scale = np.sqrt(np.asarray(surface.vertex_areas, np.float64))
-    matrix: Any = scipy.sparse.diags_array(scale) @ laplacian_matrix(surface) @ scipy.sparse.diags_array(1 / scale)
-    count = min(_PRODUCTS, surface.num_vertices)
-    basis, hessenberg = np.zeros((count + 1, surface.num_vertices)), np.zeros((count + 1, count))
-    start = np.random.default_rng(0).normal(size=surface.num_vertices)
+    scale, size = np.sqrt(vertex_areas.astype(np.float64)), len(vertex_areas)
+    matrix: Any = scipy.sparse.diags_array(scale) @ operator @ scipy.sparse.diags_array(1 / scale)
+    count = min(_PRODUCTS, size)
+    basis, hessenberg = np.zeros((count + 1, size)), np.zeros((count + 1, count))
+    start = np.random.default_rng(0).normal(size=size)
     basis[0] = start / np.linalg.norm(start)
     for k in range(count):
         new = matrix @ basis[k]
-        size = np.linalg.norm(new)
+        length = np.linalg.norm(new)
         for _ in range(2):  # the second time for rounding
             along = basis[: k + 1] @ new
             hessenberg[: k + 1, k] += along
             new -= along @ basis[: k + 1]
         hessenberg[k + 1, k] = np.linalg.norm(new)
-        if hessenberg[k + 1, k] <= 1e-12 * size:
+        if hessenberg[k + 1, k] <= 1e-12 * length:
             count = k + 1
             break
         basis[k + 1] = new / hessenberg[k + 1, k]

@@ -87,8 +87,8 @@ class ReactionDiffusion(Equation):
         return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The diffusion's bound plus the spectral radius of the reaction's largest derivatives, in any units of the
-        species."""
+        """The diffusion's bound plus the spectral radius of the reaction's largest derivatives, nearly
+        independent of the units of the species."""
         self._check(u)
         reaction = _spectral_radius(jnp.max(jnp.abs(self._jacobian(u)), axis=0))
         return spread_bound(surface, self.diffusivity, self.boundary, t, u) + reaction
@@ -98,12 +98,17 @@ class ReactionDiffusion(Equation):
         del t
         self._check(u)
         jacobian = self._jacobian(u)
-        # Two species turn about one another at this frequency at most. More of them also turn in longer cycles, whose
-        # frequency is at most the spectral radius of what is off the diagonal.
-        turning = jnp.sqrt(jnp.maximum(-jacobian * jnp.swapaxes(jacobian, 1, 2), 0))
-        if u.shape[1] > 2:
-            turning = jnp.abs(jacobian) * (1 - jnp.eye(u.shape[1], dtype=u.dtype))[None]
-        return spread_width(surface, self.diffusivity, u) + 2 * _spectral_radius(jnp.max(turning, axis=0))
+        if u.shape[1] == 2:
+            # Two species turn about one another where one promotes and is inhibited by the other, which need not be at
+            # the same vertex, as diffusion leads from one to another.
+            promotes, inhibits = (jnp.max(jnp.maximum(part, 0), axis=0) for part in (jacobian, -jacobian))
+            products = promotes * inhibits.T
+            frequency = jnp.sqrt(jnp.maximum(products[0, 1], products[1, 0]))
+        else:
+            # More of them also turn in longer cycles.
+            others = 1 - jnp.eye(u.shape[1], dtype=u.dtype)
+            frequency = _spectral_radius(jnp.max(jnp.abs(jacobian), axis=0) * others)
+        return spread_width(surface, self.diffusivity, u) + 2 * frequency
 
     def _jacobian(self, u: Array) -> Array:
         """The derivatives of the reaction's rates at every vertex, (V, S, S); what bounds steps has no derivatives."""

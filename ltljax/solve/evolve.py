@@ -39,6 +39,8 @@ _ALMOST_ALL = 1e-6
 # With a scheme that has growing modes a state that is this many times its start, or what the first rate would make of
 # it, is on its way to overflow.
 _GROWN = 1e6
+# At these shares of a run its source is looked at for that.
+_SHARES = (0.0, 0.382, 1.0)
 
 # Linear runs are quicker with implicit steps where they are this many times as long as the fastest decay, over the cube
 # root of the tolerance: explicit steps are as long as stability allows, implicit ones as the tolerance does. See
@@ -288,7 +290,7 @@ def solve(
         why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
         checks.step(equation, surface, u0, t0, dt, method)
-    if not surface.is_traced and not isinstance(method, ImplicitRungeKutta | SBDF2):
+    if not surface.is_traced and isinstance(method, Stabilised):
         surface = eqx.tree_at(
             lambda s: s.geometry.spectral_width, surface, spectral_width(surface), is_leaf=lambda leaf: leaf is None
         )
@@ -511,7 +513,7 @@ def _start_and_rules(equation, surface, t0, span, u0, solver, stop_when) -> tupl
     rate = closed(lambda t, u: term.vf(t, u, (equation, surface)), t0, u0)
     extent = closed(lambda t, u: solver.extent(t, u, (equation, surface)), t0, u0)
     condition = None if stop_when is None else closed(_checked(stop_when), t0, u0, u0)
-    return (u0, rate), taped.Rules(*_constant((solver, extent, _largest(surface, u0, rate(t0, u0) * span), condition)))
+    return (u0, rate), taped.Rules(*_constant((solver, extent, _largest(surface, u0, rate, t0, span), condition)))
 
 
 def _checked(stop_when: Condition) -> Condition:
@@ -531,15 +533,16 @@ def _constant(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-def _largest(surface: Surface, u0: Array, change: Array) -> Array:
-    """What no state may exceed, if it begins like this and would change so much at the first rate."""
+def _largest(surface: Surface, u0: Array, rate: Callable[[Array, Array], Array], t0: Array, span: Array) -> Array:
+    """What no state may exceed of a run that begins like this."""
     # A rate that is larger by the stiffness would be no number.
     largest = jnp.asarray(_ALMOST_ALL * jnp.finfo(u0.dtype).max, u0.dtype)
     if isinstance(surface.scheme, Monotone):
         return largest
-    # Growing modes get there by ever shorter steps: what grew beyond this is on its way. What begins with nothing has
-    # no size to compare with.
-    size = jnp.maximum(jnp.max(jnp.abs(u0)), jnp.max(jnp.abs(change)))
+    # Growing modes get there by ever shorter steps: what grew beyond the start, and what the rates there would make of
+    # it, is on its way. A source may begin later, so that rates count at several times.
+    changes = [jnp.max(jnp.abs(rate(t0 + share * span, u0) * span)) for share in _SHARES]
+    size = jnp.max(jnp.stack([jnp.max(jnp.abs(u0)), *changes]))
     return jnp.where(size > 0, jnp.minimum(largest, _GROWN * size), largest)
 
 
@@ -555,7 +558,7 @@ def _solve(
     equation, surface, u0, t0, t1, ts, solver, adjoint, meter, rtol, atol, grid, max_steps, stop_when, dense
 ) -> Solution:
     u0 = equation.held(t0, surface, u0)
-    largest = _largest(surface, u0, equation.rate(t0, surface, u0) * (t1 - t0))
+    largest = _largest(surface, u0, lambda t, u: equation.rate(t, surface, u), t0, t1 - t0)
 
     def stop(t, u, args):
         equation, surface = args

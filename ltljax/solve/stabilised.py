@@ -219,7 +219,8 @@ class RKL2(Stabilised):
     derivative, which lie near the negative real axis. Each step takes the least s for its own length, so the number
     of evaluations grows with the square root of the stiffness, where an explicit method's grows with the stiffness.
     A step halves what is stiff, which keeps the error estimate from being led by it, and leaves room for eigenvalues
-    off the axis; Chebyshev's polynomials reach 30 % further with s stages, and have neither.
+    off the axis; Chebyshev's polynomials reach 30 % further with s stages, and have neither. An oscillation that is
+    hardly damped needs steps that resolve it, of about one over its angular frequency: longer fixed steps let it grow.
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.
@@ -255,7 +256,8 @@ class RKL2(Stabilised):
 class RKL1(Stabilised):
     """Runge-Kutta-Legendre of first order: explicit, and with `Monotone` diffusion it keeps the maximum principle.
 
-    Stable where ``dt * bound <= s^2 + s``. The error is estimated by the difference from the trapezoidal rule.
+    Stable where ``dt * bound <= s^2 + s``. The error is estimated by the difference from the trapezoidal rule. Like
+    every explicit method of first order it lets an oscillation grow that is hardly damped: take `RKL2` for those.
 
     Attributes:
         spectral_bound: ``(t, y, args) -> bound``; by default that of the equation.

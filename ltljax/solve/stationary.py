@@ -278,8 +278,8 @@ def steady_state(
     Of any other equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
     rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
     state is steady, then takes Newton's last step (for `Diffusion` the linear system). Differentiable in reverse and
-    forward mode by the implicit function theorem, in everything but u0. Where the state is determined by u0 only up to
-    a constant, which is so for a diffusivity that varies where nothing holds or absorbs, it has no derivatives.
+    forward mode by the implicit function theorem, in everything but u0. With a diffusivity that varies and no condition
+    that holds or absorbs, the state is fixed only up to a constant that u0 sets, and has no derivatives.
 
     Args:
         equation: the equation.

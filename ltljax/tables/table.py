@@ -282,7 +282,7 @@ def slot_sum(table: Table, weights: tuple[AnyArray, ...]) -> AnyArray:
     return table.map(lambda block, w: w.sum(axis=0), weights)
 
 
-def coordinates(table: Table, weights: tuple[Array, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def coordinates(table: Table, weights: tuple[AnyArray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, columns and values of the used slots (host), for a sparse matrix of the sum over neighbours."""
     rows, columns, values = [], [], []
     for block, weight in zip(table.blocks, weights, strict=True):
@@ -295,7 +295,7 @@ def coordinates(table: Table, weights: tuple[Array, ...]) -> tuple[np.ndarray, n
     return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
 
-def difference_matrix(table: Table, weights: tuple[Array, ...]) -> scipy.sparse.csr_array:
+def difference_matrix(table: Table, weights: tuple[AnyArray, ...]) -> scipy.sparse.csr_array:
     """The sparse matrix (V, V) of `difference_sum` (host)."""
     rows, columns, values = coordinates(table, weights)
     size = table.num_vertices
