@@ -290,12 +290,12 @@ def _largest_advection(targets: AnyArray) -> AnyArray:
     # In units in which D has the trace 2, so that no product leaves the range of the float type.
     unit = (xx + yy) / 2
     unit = xp.where(unit > 0, unit, 1)
-    xx, yy, cross = xx / unit, yy / unit, cross / unit
+    xx, yy, cross, x, y = xx / unit, yy / unit, cross / unit, x / xp.sqrt(unit), y / xp.sqrt(unit)
     determinant = xx * yy - cross**2
     is_regular = determinant > 4 * xp.finfo(targets.dtype).eps
     across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
-    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1) / unit, xp.inf)
-    return xp.asarray(xp.max(xp.where(x**2 + y**2 > 0, ratio, 0)))
+    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1), xp.inf)
+    return xp.asarray(xp.max(xp.where((x != 0) | (y != 0), ratio, 0)))
 
 
 def _spectral_width(table: Table, weights: PerBlock, advection: AnyArray, measured: float | None = None) -> AnyArray:
@@ -372,7 +372,9 @@ def _flux_weights(
         return weights
     xp = weights.__array_namespace__()
     marks = [
-        with_columns(0 * block.centre(targets[0, 0])[None], rows.columns, 0 * rows.columns[None] + 1.0)[0]
+        with_columns(
+            0 * block.centre(targets[0, 0])[None], rows.columns, xp.ones((1, *rows.columns.shape), weights.dtype)
+        )[0]
         for block, rows in zip(table.blocks, cotangent_rows, strict=True)
     ]
     is_cotangent = table.rows_from(marks)[topology.boundary] > 0

@@ -56,11 +56,6 @@ def test_a_flow_carries_a_field_around_the_sphere():
     assert jnp.linalg.norm(u - expected) < 0.05 * jnp.linalg.norm(expected)
 
 
-def test_fluxes_need_numbers_as_diffusivities():
-    with pytest.raises(ValueError, match="need a number"):
-        ltl.ReactionDiffusion((jnp.ones(5),), no_reaction(1), boundary=ltl.Neumann(1.0))
-
-
 def test_stripes_follow_a_direction_field():
     mesh = ltl.shapes.icosphere(4)
     surface = ltl.Surface.from_mesh(mesh)

@@ -189,7 +189,7 @@ def test_the_published_scheme_says_what_it_lacks():
 
 
 def test_a_mesh_on_which_a_fit_of_high_degree_does_not_pay_is_said():
-    with pytest.warns(ltl.CoarseMeshWarning, match=r"ltl\.Monotone\(\) is as accurate or more"):
+    with pytest.warns(ltl.CoarseMeshWarning, match=r"ltl\.Monotone\(\) was as accurate or more"):
         ltl.Surface.from_mesh(ltl.shapes.torus(2.0, 1.0, 28, 14), ltl.Polynomial())
     with warnings.catch_warnings():
         warnings.simplefilter("error", ltl.CoarseMeshWarning)

@@ -571,4 +571,4 @@ def test_a_scenario_runs_with_fixed_steps_of_sbdf2(tmp_path):
         PLAIN.replace("[initial]", '[solver]\nname = "SBDF2"\ndt = 1e-3\n[initial]'), encoding="utf-8"
     )
     assert main(["run", str(tmp_path / "my.toml"), "--out", str(tmp_path / "out"), "--set", "time.end=0.01"]) == 0
-    assert json.loads((tmp_path / "out/summary.json").read_text())["reached_time"] == pytest.approx(0.01)
+    assert json.loads((tmp_path / "out/summary.json").read_text())["measured"]["reached_time"] == pytest.approx(0.01)

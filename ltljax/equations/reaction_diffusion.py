@@ -75,6 +75,7 @@ class ReactionDiffusion(Equation):
 
     def diffusivities(self, u):
         """One number for each species; of what varies, the mean."""
+        self._check(u)
         return mean_diffusivities(self.diffusivity, u)
 
     @property
