@@ -287,14 +287,15 @@ def _largest_advection(targets: AnyArray) -> AnyArray:
     """
     xp = targets.__array_namespace__()
     x, y, cross, xx, yy = targets[0, 0], targets[0, 1], targets[0, 2] / 2, targets[0, 3] / 2, targets[0, 4] / 2
-    # In units in which D has the trace 2, so that no product leaves the range of the float type.
-    unit = (xx + yy) / 2
-    unit = xp.where(unit > 0, unit, 1)
-    xx, yy, cross, x, y = xx / unit, yy / unit, cross / unit, x / xp.sqrt(unit), y / xp.sqrt(unit)
-    determinant = xx * yy - cross**2
-    is_regular = determinant > 4 * xp.finfo(targets.dtype).eps
-    across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
-    ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1), xp.inf)
+    with np.errstate(over="ignore"):  # to infinity, where there is next to no diffusion
+        # In units in which D has the trace 2, so that no product leaves the range of the float type.
+        unit = (xx + yy) / 2
+        unit = xp.where(unit > 0, unit, 1)
+        xx, yy, cross, x, y = xx / unit, yy / unit, cross / unit, x / xp.sqrt(unit), y / xp.sqrt(unit)
+        determinant = xx * yy - cross**2
+        is_regular = determinant > 4 * xp.finfo(targets.dtype).eps
+        across = xp.maximum(yy * x**2 - 2 * cross * x * y + xx * y**2, 0)
+        ratio = xp.where(is_regular, across / xp.where(is_regular, determinant, 1), xp.inf)
     return xp.asarray(xp.max(xp.where((x != 0) | (y != 0), ratio, 0)))
 
 

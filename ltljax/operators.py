@@ -328,8 +328,9 @@ def measured_width(operator: scipy.sparse.csr_array, vertex_areas: np.ndarray) -
     matrix: Any = scipy.sparse.diags_array(scale) @ operator @ scipy.sparse.diags_array(1 / scale)
     # The iteration sees little beyond the fastest rows where these are far faster than most. Slowed down they leave the
     # other modes nearly as they are, as their vertices follow the neighbours anyway.
-    limits = [np.inf, *(times * np.median(sums) for times in _SLOWED)]
-    slowed = [np.minimum(1, limit / np.maximum(sums, np.finfo(float).tiny)) for limit in limits]
+    active = np.where(sums > 0, sums, 1)
+    limits = [np.inf, *(times * np.median(active) for times in _SLOWED)]
+    slowed = [np.minimum(active, limit) / active for limit in limits]
     return max(
         _rim(scipy.sparse.diags_array(share) @ matrix) for share in slowed if share.min() < 1 or share is slowed[0]
     )
