@@ -328,9 +328,12 @@ def measured_width(operator: scipy.sparse.csr_array, vertex_areas: np.ndarray) -
     matrix: Any = scipy.sparse.diags_array(scale) @ operator @ scipy.sparse.diags_array(1 / scale)
     # The iteration sees little beyond the fastest rows where these are far faster than most. Slowed down they leave the
     # other modes nearly as they are, as their vertices follow the neighbours anyway.
-    active = np.where(sums > 0, sums, 1)
-    limits = [np.inf, *(times * np.median(active) for times in _SLOWED)]
-    slowed = [np.minimum(active, limit) / active for limit in limits]
+    if not sums.any():
+        return 0.0
+    # Rows of zeros stay as they are.
+    median = np.median(sums[sums > 0])
+    active = np.where(sums > 0, sums, median)
+    slowed = [np.minimum(active, limit) / active for limit in (np.inf, *(times * median for times in _SLOWED))]
     return max(
         _rim(scipy.sparse.diags_array(share) @ matrix) for share in slowed if share.min() < 1 or share is slowed[0]
     )

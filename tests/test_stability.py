@@ -198,7 +198,7 @@ def test_a_source_that_begins_is_no_overflow(scheme, start):
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), scheme=scheme)
     equation = ltl.Diffusion(1.0, source=lambda t, x: t * x[:, 2])
     end = ltl.solve(equation, surface, jnp.full(surface.num_vertices, start), 0.1, rtol=1e-6).u_end
-    # Of u' = -2 u + t: t / 2 - (1 - exp(-2 t)) / 4.
+    # The solution of u' = -2 u + t with u(0) = 0 is t / 2 - (1 - exp(-2 t)) / 4.
     assert float(jnp.max(end)) == pytest.approx(0.05 - (1 - np.exp(-0.2)) / 4, rel=0.02)
 
 

@@ -88,7 +88,7 @@ def test_lengths_whose_weights_leave_the_float_type_are_refused(factor):
 
 
 def test_a_mesh_is_not_refused_because_one_block_of_its_weights_is_zero():
-    # Of the Hessian's weights whole blocks may vanish, where rows of one length are few.
+    # If few rows have the same length, all their weights in one component of the Hessian can be zero.
     points = np.random.default_rng(0).random((100, 2))
     points = np.concatenate([points, [[0, 0], [1, 0], [0, 1], [1, 1]]])
     mesh = ltl.Mesh(
