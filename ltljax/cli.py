@@ -17,13 +17,16 @@ import jax
 from . import process, scenario
 from .fit import FitError
 from .lifting.schemes import Monotone, Paper, Polynomial, Scheme
-from .mesh import load_mesh
+from .mesh import MeshError, load_mesh
+from .mesh.errors import in_one_line
 from .process.fields import FIELDS
 from .process.images import METHODS
 from .process.shapes import SMOOTHINGS
 from .recover import recover
 from .run import run
 from .solve import SolveError
+
+_OUT = Path("out")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -47,15 +50,16 @@ def main(arguments: list[str] | None = None) -> int:
     except (SolveError, FitError) as error:
         return _fail(error, 1)
     except KeyboardInterrupt:
-        print("ltljax: interrupted; what was written so far is kept.", file=sys.stderr)
+        said = "interrupted"
+        if options.command in (_run, _fit):
+            said += "; what was written so far is kept. Go on with the same command and --resume, or begin anew with "
+            said += "--overwrite"
+        print(f"ltljax: {said}.", file=sys.stderr)
         return 130
 
 
 def _fail(error: Exception, code: int) -> int:
-    line = " ".join(str(error).split())
-    # Control characters would speak to the terminal.
-    line = "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in line)
-    print(f"ltljax: {line}", file=sys.stderr)
+    print(f"ltljax: {in_one_line(str(error))}", file=sys.stderr)
     return code
 
 
@@ -74,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="a value of a scenario file, such as kinetics.feed=0.05; may be given several times",
     )  # fmt: skip
-    run_.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
+    run_.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: out/ and the scenario's name)")
     run_.add_argument(
         "--source", choices=scenario.SOURCES, help="heat on the torus: the source (default: angle-zero-mean)"
     )
@@ -92,6 +96,13 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument("--t1", type=_positive, help="end of the run (default: the scenario's)")
     run_.add_argument("--frames", type=_count, help="states kept, evenly spaced in time (default: mostly 60)")
     run_.add_argument("--seed", type=_seed, help="of the random numbers (default: 0)")
+    run_.add_argument(
+        "--scale", type=_positive, help="factor by which patterns grow; 2 multiplies each diffusivity by four"
+    )
+    run_.add_argument("--view", choices=scenario.VIEWS, help="from where pictures look (default: aslant)")
+    run_.add_argument(
+        "--texture", type=_count, metavar="PIXELS", help="an edge of the image on a mesh's UV map (default: 1024)"
+    )
     run_.add_argument("--dtype", choices=("float32", "float64"), help="default: mostly float64")
     run_.add_argument(
         "--keep-scale", action="store_true", help="mesh files: do not scale the area to the unit sphere's"
@@ -100,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted: the same command, the same --out"
     )
+    run_.add_argument("--overwrite", action="store_true", help="begin anew where a run was interrupted")
 
     fit = commands.add_parser("fit", help="find numbers of a scenario file from what was seen")
     fit.set_defaults(command=_fit)
@@ -109,8 +121,11 @@ def _parser() -> argparse.ArgumentParser:
         help="a value of the file, such as kinetics.feed=0.05; may be given several times",
     )  # fmt: skip
     fit.add_argument("--mesh", help="a mesh file, in place of the file's own mesh")
-    fit.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)")
+    fit.add_argument(
+        "--out", type=Path, metavar="DIR", help="where to write (default: out/ and the scenario's name, and -fit)"
+    )
     fit.add_argument("--resume", action="store_true", help="go on with a fit that was interrupted: the same --out")
+    fit.add_argument("--overwrite", action="store_true", help="begin anew where a fit was interrupted")
 
     new = commands.add_parser("new", help="print a scenario file to start from: ltljax new gray-scott > my.toml")
     new.set_defaults(command=_new)
@@ -133,7 +148,7 @@ def _add_commands_on_meshes(commands: Any) -> None:
         parser.set_defaults(command=_on_mesh, on_mesh=on_mesh)
         parser.add_argument("mesh", help="sphere, torus, disk, box, or a mesh file, which keeps its scale")
         parser.add_argument(
-            "--out", type=Path, default=Path("out"), metavar="DIR", help="where to write (default: out)"
+            "--out", type=Path, default=_OUT / name, metavar="DIR", help=f"where to write (default: {_OUT / name})"
         )
         parser.add_argument("--repair", action="store_true", help="mend what can be mended")
         return parser
@@ -221,7 +236,13 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _info(options: argparse.Namespace) -> int:
-    print(load_mesh(options.mesh, repair=options.repair).report)
+    try:
+        print(load_mesh(options.mesh, repair=options.repair).report)
+    except MeshError as error:
+        if options.repair or not Path(options.mesh).is_file():
+            raise
+        report = load_mesh(options.mesh, repair=True).report  # which raises where nothing can be made of it
+        print(f"not acceptable as it is: {in_one_line(str(error))}\n\nwith --repair:\n{report}")
     return 0
 
 
@@ -280,8 +301,12 @@ def _run(options: argparse.Namespace) -> int:
             repair=options.repair,
             seed=options.seed or 0,
             t1=options.t1,
+            scale=options.scale or 1.0,
         )
         example, record = scenario.SCENARIOS[options.scenario](chosen), dataclasses.asdict(chosen)
+        shown = {"view": options.view, "texture": options.texture}
+        settings = dataclasses.replace(example.settings, **{key: value for key, value in shown.items() if value})
+        example = dataclasses.replace(example, settings=settings)
     else:
         example, mesh = _from_file(options)
         record = dict(scenario=options.scenario, mesh=mesh, changes=options.changes)
@@ -291,7 +316,8 @@ def _run(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", dtype == "float64")
     run(
         example, record, scheme=_scheme(options.scheme or example.settings.scheme, degree), dtype=dtype,
-        frames=options.frames or example.frames, out=options.out, inputs=inputs, resume=options.resume,
+        frames=options.frames or example.frames, out=options.out or _OUT / example.name, inputs=inputs,
+        resume=options.resume, overwrite=options.overwrite,
     )  # fmt: skip
     return 0
 
@@ -308,9 +334,10 @@ def _fit(options: argparse.Namespace) -> int:
     recover(
         example,
         scheme=_scheme(example.settings.scheme, example.settings.degree),
-        out=options.out,
+        out=options.out or _OUT / f"{example.name}-fit",
         inputs=(path, *([mesh_file] if mesh_file else [])),
         resume=options.resume,
+        overwrite=options.overwrite,
     )
     return 0
 
@@ -334,10 +361,14 @@ def _from_file(options: argparse.Namespace) -> tuple[scenario.Scenario, str]:
         )
     given = {"time.end": options.t1, "time.frames": options.frames, "seed": options.seed}
     given |= {"solver.dtype": options.dtype, "solver.scheme": options.scheme, "solver.degree": options.degree}
+    given |= {"scale": options.scale, "output.view": options.view, "output.texture": options.texture}
     given |= {"mesh.repair": options.repair or None, "mesh.scale": "keep" if options.keep_scale else None}
     # The mesh first, so that what else is said of it still holds.
     changes: dict[str, Any] = {"mesh": {"shape": options.mesh}} if options.mesh in scenario.BUILT_IN else {}
     changes |= {key: value for key, value in given.items() if value is not None}
     changes |= dict(scenario.parse_change(change) for change in options.changes)
     mesh_file = None if options.mesh is None or options.mesh in scenario.BUILT_IN else Path(options.mesh)
+    # The person at the command line may name any file; a scenario file may name only files beside it.
+    if isinstance(named := changes.get("mesh.file"), str) and Path(named).is_absolute():
+        mesh_file = Path(changes.pop("mesh.file"))
     return scenario.read(text, options.scenario, folder, changes, mesh_file), options.mesh or "its own mesh"

@@ -13,18 +13,32 @@ import numpy as np
 import tomli_w
 
 from .fit import Experiment, Fit, Observations, Positive, fit
+from .folder import Folder
 from .lifting.schemes import Scheme
 from .progress import noted
 from .scenario import Scenario
+from .solve.restart import RestartError
 from .surface import FarFromOriginWarning, Surface
 
+_RESULTS = ("fit.json", "fitted.toml", "fit.png")
+_UNKNOWNS = "unknowns.npz"
+_WAYS = "Go on with it by --resume, begin anew by --overwrite, or name another --out."
 
-def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Path] = (), resume: bool = False) -> Fit:
+
+def recover(
+    example: Scenario,
+    *,
+    scheme: Scheme,
+    out: Path,
+    inputs: Iterable[Path] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Fit:
     """Fit the numbers that a scenario leaves free, and write what was found.
 
     In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
-    ``fitted.toml``, the scenario with the numbers found, to be run; and until it has converged ``unknowns.npz``, to
-    resume from.
+    ``fitted.toml``, the scenario with the numbers found, to be run; and ``restart/unknowns.npz``, to resume from, until
+    the fit has converged.
 
     Args:
         example: the scenario.
@@ -32,11 +46,14 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Pa
         out: the folder to write to; made if absent.
         inputs: files that are read beside those the scenario names, and must not be replaced.
         resume: whether to begin with what an interrupted fit of the same data left there.
+        overwrite: whether to begin anew where a fit that has not converged left something.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.
-        OutputError: the results would replace one of the files that are read, or one that no fit has written.
-        RestartError: what is there was left by another fit.
+        OutputError: the results would replace one of the files that are read, or one that ltljax has not written; or
+            another fit is writing there.
+        RestartError: the folder holds another fit, or one that has not converged and neither ``resume`` nor
+            ``overwrite`` was given.
         FitError: the run fails at the first guess.
     """
     wanted = example.wanted
@@ -45,24 +62,28 @@ def recover(example: Scenario, *, scheme: Scheme, out: Path, inputs: Iterable[Pa
             f"{example.name} has no table [fit]: name the numbers to find as free = [...] and files of data as "
             "[[fit.data]] with file and time."
         )
-    from .output import folder
-
-    folder.check_fit_folder(out, (*inputs, *example.files.values(), *wanted.files))
-    out.mkdir(parents=True, exist_ok=True)
-    with noted(FarFromOriginWarning):
+    folder, restart = Folder(out), Folder(out / "restart")
+    folder.check(_RESULTS, (*inputs, *example.files.values(), *wanted.files))
+    if restart.owns(_UNKNOWNS) and not resume and not overwrite:
+        raise RestartError(f"{restart.path} holds a fit that has not converged. {_WAYS}")
+    with folder.locked(), noted(FarFromOriginWarning):
         surface = Surface.from_mesh(example.mesh, scheme, example.settings.dtype)
-    settings = example.settings
-    experiment = Experiment(
-        lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
-        solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
-    )  # fmt: skip
-    data = Observations(wanted.values, wanted.noise, wanted.times, wanted.vertices, wanted.species)
-    found = fit(
-        experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
-        checkpoint=out / "unknowns.npz", resume=resume,
-    )  # fmt: skip
-    print(found.summary())
-    files = _write(example, found, surface, out)
+        settings = example.settings
+        experiment = Experiment(
+            lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
+            solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
+        )  # fmt: skip
+        data = Observations(wanted.values, wanted.noise, wanted.times, wanted.vertices, wanted.species)
+        found = fit(
+            experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
+            checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),
+        )  # fmt: skip
+        print(found.summary())
+        with folder.draft() as draft:
+            files = _write(example, found, surface, draft)
+        if found.converged:
+            with restart.locked():
+                restart.remove_itself()
     print(f"written to {out}: {', '.join(files)}")
     return found
 
@@ -101,6 +122,4 @@ def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[s
     else:
         figure.savefig(out / "fit.png", dpi=110)
         files.append("fit.png")
-    if found.converged:
-        (out / "unknowns.npz").unlink(missing_ok=True)
     return files

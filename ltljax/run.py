@@ -20,16 +20,20 @@ import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
+from .folder import Folder, OutputError, copies
 from .lifting.schemes import Monotone, Scheme
-from .mesh import Mesh
+from .mesh import Mesh, vertex_normals
 from .operators import integrate
 from .progress import noted, watched
 from .scenario import Scenario
 from .solve import GrowingModesWarning, SolveError, solve
-from .solve.restart import Keeper, fingerprint
+from .solve.fingerprint import fingerprint
+from .solve.restart import Keeper
 from .surface import FarFromOriginWarning, Surface
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
+_RESTART = "restart"
+_WAYS = "Go on with it by --resume, begin anew by --overwrite, or name another --out."
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000
 # Bytes of a viewer's page from which on it is said.
@@ -57,10 +61,12 @@ def run(
     out: Path,
     inputs: Iterable[Path] = (),
     resume: bool = False,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Solve a scenario and write its results.
 
     While it runs, every state is put on disk in ``out/restart``, so that a run that is killed can be taken up again.
+    Results that are there from before stay as they are until all new ones are complete.
 
     Args:
         example: the scenario.
@@ -71,74 +77,106 @@ def run(
         out: the folder to write to; made if absent.
         inputs: files that the run is made from, besides those the scenario names.
         resume: whether to go on from what ``out/restart`` holds of the same run.
+        overwrite: whether to begin anew where ``out/restart`` holds a run that has not ended.
 
     Returns:
         What ``summary.json`` holds.
 
     Raises:
         SolveError: the run could not be carried to its end. What it had reached is written all the same.
-        RestartError: ``out/restart`` holds the states of another run, or they are damaged.
-        OutputError: results would replace what the run reads, or what no run has written.
+        RestartError: ``out/restart`` holds the states of another run, or of one that has not ended, and it was neither
+            to be resumed nor to be overwritten.
+        OutputError: results would replace what the run reads, or what ltljax has not written; or another run is writing
+            to ``out``; or the disk is full.
     """
-    from .output import folder
-
-    folder.check_folder(out, example.name, (*inputs, *example.files.values()), example.files)
-    out.mkdir(parents=True, exist_ok=True)
-    mesh = example.mesh
-    start = time.perf_counter()
-    # Results are written where the mesh lies, wherever the surface takes positions from.
-    with noted(FarFromOriginWarning):
-        surface = Surface.from_mesh(mesh, scheme, dtype, progress=mesh.num_vertices > _LONG_BUILD)
+    folder = Folder(out)
+    folder.check(_result_names(example, frames), (*inputs, *example.files.values()))
+    # The copies of inputs may be what is read: a run is repeated from its own folder.
+    folder.check(copies(example.files).values())
+    with folder.locked():
+        start = time.perf_counter()
+        # Results are written where the mesh lies, wherever the surface takes positions from.
+        with noted(FarFromOriginWarning):
+            surface = Surface.from_mesh(example.mesh, scheme, dtype, progress=example.mesh.num_vertices > _LONG_BUILD)
         build_seconds = time.perf_counter() - start
-        print(f"{example.name} on {options['mesh']}: {mesh.num_vertices} vertices, {mesh.num_faces} faces, {scheme}")
+        print(
+            f"{example.name} on {options['mesh']}: {example.mesh.num_vertices} vertices, {example.mesh.num_faces} "
+            f"faces, {scheme}"
+        )
         for note in example.notes:
             print(f"note: {note}")
-
-    reached = _Progress([0.0], [example.u0])
-    times = np.linspace(0, example.t1, frames + 1)
-    same = dict(
-        mesh=fingerprint((mesh.vertices, mesh.faces)),
-        scenario=fingerprint((example.name, example.parameters, example.u0, options)),
-        numbers=fingerprint((times, repr(scheme), dtype)),
-    )
-    keeper = Keeper(out / "restart", same, resume)
-    failure = None
-    try:
-        _advance(example, surface, times, reached, keeper)
-    except SolveError as error:
-        failure = error
-    measured = _measure(example, surface, reached)
-    measured["build_seconds"] = build_seconds
-    for name, value in measured.items():
-        print(f"{name.replace('_', ' '):32} {_readable(value)}")
-
-    files = _write(example, np.asarray(surface.normals), out, reached)
-    if example.resolved is not None:
-        files += _keep_scenario(example.resolved, folder.keep_inputs(out, example.files), out)
-    summary = dict(
-        scenario=example.name,
-        options=options,
-        parameters=example.parameters,
-        scheme=repr(surface.scheme),
-        dtype=dtype,
-        frames=frames,
-        t1=example.t1,
-        tolerances=dict(rtol=example.settings.rtol, atol=example.settings.atol),
-        notes=example.notes,
-        failure=None if failure is None else str(failure),
-        measured=measured,
-        mesh=mesh.report.as_dict(),
-        surface=str(surface.report).splitlines(),
-        files=files,
-        versions=_versions(),
-        device=str(jax.devices()[0]),
-    )
-    (out / "summary.json").write_text(json.dumps(summary, indent=2, default=_as_json) + "\n")
-    print(f"{'written to':32} {out}: {', '.join([*files, 'summary.json'])}")
-    keeper.remove()
+        reached = _Progress([0.0], [example.u0])
+        times = np.linspace(0, example.t1, frames + 1)
+        same = dict(
+            mesh=fingerprint((example.mesh.vertices, example.mesh.faces)),
+            scenario=fingerprint((example.name, example.parameters, example.u0, options)),
+            numbers=fingerprint((times, repr(scheme), dtype)),
+        )
+        keeper = Keeper(folder, same, resume, _RESTART, overwrite, _WAYS)
+        failure = None
+        try:
+            _advance(example, surface, times, reached, keeper)
+        except SolveError as error:
+            failure = error
+        measured = _measure(example, surface, reached)
+        measured["build_seconds"] = build_seconds
+        for name, value in measured.items():
+            print(f"{name.replace('_', ' '):32} {_readable(value)}")
+        summary: dict[str, Any] = dict(
+            scenario=example.name,
+            options=options,
+            parameters=example.parameters,
+            scheme=repr(surface.scheme),
+            dtype=dtype,
+            frames=frames,
+            t1=example.t1,
+            tolerances=dict(rtol=example.settings.rtol, atol=example.settings.atol),
+            notes=example.notes,
+            failure=None if failure is None else str(failure),
+            measured=measured,
+            mesh=example.mesh.report.as_dict(),
+            surface=str(surface.report).splitlines(),
+            files=[],
+            versions=_versions(),
+            device=str(jax.devices()[0]),
+        )
+        try:
+            _put(example, np.asarray(surface.normals), folder, reached, summary)
+        except OSError as error:
+            raise OutputError(
+                f"The results could not be written: {error}. What was computed is kept in {out / _RESTART}: make room, "
+                "and give the same command with --resume."
+            ) from error
+        keeper.remove()
+    print(f"{'written to':32} {out}: {', '.join([*summary['files'], 'summary.json'])}")
     if failure is not None:
         raise failure
     return summary
+
+
+def _result_names(example: Scenario, frames: int) -> list[str]:
+    """The names of all files that a run may write."""
+    name = example.name
+    names = [f"{name}.{ending}" for ending in ("html", "pvd", "ply", "glb", "png", "mp4", "gif")]
+    names += [f"textured/{name}.{ending}" for ending in ("obj", "mtl", "png")]
+    names += [f"series/{name}_{index:04d}.vtp" for index in range(frames + 1)]
+    if example.resolved is not None:
+        names.append("scenario.toml")
+    return [*names, f"{name}-displaced.glb", "summary.json"]
+
+
+def _put(example: Scenario, normals: np.ndarray, folder: Folder, reached: _Progress, summary: dict[str, Any]) -> None:
+    """Write all results, which take the places of those of an earlier run together."""
+    with folder.draft() as draft:
+        files = _write(example, normals, draft, reached)
+        if example.resolved is not None:
+            files += _keep_scenario(example.resolved, folder.keep_inputs(draft, example.files), draft)
+        summary["files"] = files
+        (draft / "summary.json").write_text(json.dumps(summary, indent=2, default=_as_json) + "\n", encoding="utf-8")
+        written = {path.relative_to(draft).as_posix() for path in draft.rglob("*") if path.is_file()}
+    # What an earlier run wrote, and this one does not.
+    own = {name for name in folder.recorded() if name.startswith(f"series/{example.name}_")}
+    folder.remove((own | set(_result_names(example, 0))) - written)
 
 
 def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _Progress, keeper: Keeper) -> None:
@@ -147,10 +185,15 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
     how: dict[str, Any] = dict(
         solver=settings.solver, rtol=settings.rtol, atol=settings.atol, dt=settings.dt, throw=False
     )
+    # Where the state of a frame is damaged or gone, the run goes on from before it.
+    is_next = [record["frame"] == index for index, record in enumerate(keeper.done, start=1)]
+    keeper.keep_first(is_next.index(False) if False in is_next else len(is_next))
+    for path in keeper.passed_over:
+        print(f"note: {path} is damaged and passed over")
     for state, record in zip(keeper.states(), keeper.done, strict=True):
         reached.times.append(record["t"])
         reached.states.append(state)
-        reached.counts = record["counts"]
+        reached.counts, reached.step_seconds = record["counts"], record["seconds"]
     if keeper.done:
         print(f"note: going on from t = {reached.times[-1]:g}")
     u = jnp.asarray(reached.states[-1], surface.dtype)
@@ -171,7 +214,13 @@ def _advance(example: Scenario, surface: Surface, times: np.ndarray, reached: _P
             reached.times.append(float(solution.t_end))
             reached.states.append(np.asarray(u))
             solution.check(surface)
-            keeper.keep(reached.states[-1], dict(t=reached.times[-1], counts=dict(reached.counts)))
+            frame = dict(
+                frame=len(reached.times) - 1,
+                t=reached.times[-1],
+                counts=dict(reached.counts),
+                seconds=reached.step_seconds,
+            )
+            keeper.keep(reached.states[-1], frame)
 
 
 def _measure(example: Scenario, surface: Surface, reached: _Progress) -> dict[str, Any]:
@@ -220,6 +269,7 @@ def count_maxima(mesh: Mesh, values: np.ndarray) -> int:
 
 
 def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress) -> list[str]:
+    """Write the series and pictures to an empty folder; returns what to call them."""
     from .output import colors, files, pictures, texture, viewer
 
     # What was computed in an order that keeps neighbours together is written in that of the source.
@@ -227,10 +277,7 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     vertices, faces = example.mesh.vertices[order], np.argsort(order)[example.mesh.faces].astype(np.int32)
     name, times, settings = example.name, np.array(reached.times), example.settings
     states = [u.reshape(len(u), -1) for u in reached.states]
-    series = out / "series"
-    series.mkdir(exist_ok=True)
-    for stale in series.glob(f"{name}_*.vtp"):
-        stale.unlink()
+    (out / "series").mkdir()
     frames = [f"series/{name}_{index:04d}.vtp" for index in range(len(times))]
     for frame, state in zip(frames, states, strict=True):
         files.write_vtp(out / frame, vertices, faces, dict(zip(example.species, state[order].T, strict=True)))
@@ -244,7 +291,7 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
     written = [f"{name}.html", f"{name}.pvd", f"series ({len(frames)} states)", f"{name}.ply", f"{name}.glb"]
     if settings.displacement and np.isfinite(last).all():
         moved = texture.displaced(vertices, normals[order], last, settings.displacement)
-        files.write_glb(out / f"{name}-displaced.glb", moved, faces, shades)
+        files.write_glb(out / f"{name}-displaced.glb", moved, faces, shades, vertex_normals(moved, faces))
         written.append(f"{name}-displaced.glb")
     columns = {s: column for column, s in enumerate(example.species)}
     whole = _Series(states, order, {shown: columns[shown]} | columns)
@@ -256,7 +303,7 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
         return written
     if example.mesh.uv is not None:
         try:
-            baked = texture.bake(example.mesh.uv, faces, last)
+            baked = texture.bake(example.mesh.uv, faces, last, settings.texture)
         except ValueError as error:
             print(f"note: no texture is written. {error}")
         else:
@@ -264,8 +311,8 @@ def _write(example: Scenario, normals: np.ndarray, out: Path, reached: _Progress
             image = colors.vertex_colors(baked.ravel(), limits, colormap)[:, :3].reshape(*baked.shape, 3)
             texture.write_textured_obj(out / "textured" / f"{name}.obj", vertices, faces, example.mesh.uv, image)
             written.append(f"textured/{name}.obj")
-    picture = pictures.Picture(vertices, faces, shown, limits, colormap)
-    captions = [f"{name}   t = {t:.3g}" for t in times]
+    picture = pictures.Picture(vertices, faces, shown, limits, colormap, settings.view)
+    captions = [f"{name}   t = {_short(t)}" for t in times]
     images = (picture.draw(u[order, example.shown], text) for u, text in zip(states, captions, strict=True))
     animation = pictures.write_animation(out / f"{name}.mp4", images)
     pictures.write_png(out / f"{name}.png", picture.draw(last, captions[-1]))
@@ -297,10 +344,10 @@ class _Series(Mapping[str, np.ndarray]):
         return len(self.columns)
 
 
-def _keep_scenario(resolved: dict[str, Any], copies: dict[str, str], out: Path) -> list[str]:
+def _keep_scenario(resolved: dict[str, Any], kept: dict[str, str], out: Path) -> list[str]:
     """The scenario with every value, naming the copies of its files: run it again, and the same comes out."""
     tables = copy.deepcopy({key: value for key, value in resolved.items() if value not in ({}, [])})
-    for key, file in copies.items():
+    for key, file in kept.items():
         *path, last = key.split(".")
         inner: Any = tables
         for part in path:
@@ -308,7 +355,14 @@ def _keep_scenario(resolved: dict[str, Any], copies: dict[str, str], out: Path) 
         inner[last] = file
     text = f"# Every value of this run: ltljax run scenario.toml\n{tomli_w.dumps(tables)}"
     (out / "scenario.toml").write_text(text, encoding="utf-8")
-    return ["scenario.toml", *copies.values()]
+    return ["scenario.toml", *kept.values()]
+
+
+def _short(number: float) -> str:
+    """A number with three digits, without an exponent where people write none."""
+    if number and not 1e-4 <= abs(number) < 1e6:
+        return f"{number:.3g}"
+    return np.format_float_positional(number, precision=3, fractional=False, trim="-")
 
 
 def _limits(states: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import trimesh
 
 import ltljax as ltl
+from ltljax import run
 from ltljax.cli import main
 from ltljax.output import files, pictures
 
@@ -40,7 +42,8 @@ def test_a_run_writes_picture_animation_series_surface_and_summary(tmp_path, mes
     mesh = ltl.shapes.icosphere(3)
     assert main(["run", "turing", "--mesh", mesh_file(mesh), "--out", str(out), "--frames", "4"]) == 0
     assert {p.name for p in out.iterdir()} == {
-        "turing.png", "turing.mp4", "turing.glb", "turing.html", "turing.pvd", "turing.ply", "series", "summary.json",
+        ".ltljax", "turing.png", "turing.mp4", "turing.glb", "turing.html", "turing.pvd", "turing.ply", "series",
+        "summary.json",
     }  # fmt: skip
     summary = json.loads((out / "summary.json").read_text())
     assert summary["mesh"]["vertices"] == 642
@@ -257,6 +260,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
         calls.append(given)
         if len(calls) == 4:  # one to compile, two frames
             raise KeyboardInterrupt
+        time.sleep(0.3)
         return ltl.solve(*given, **named)
 
     pieces = [*arguments, "--out", str(tmp_path / "pieces")]
@@ -264,7 +268,10 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
         patched.setattr(sys.modules["ltljax.run"], "solve", interrupted)
         assert main(pieces) == 130
     assert (tmp_path / "pieces" / "restart" / "run.json").exists()
-    capsys.readouterr()
+    assert "Go on with the same command and --resume, or begin anew with --overwrite." in capsys.readouterr().err
+    code, error = fails(capsys, *pieces)
+    assert code == 2
+    assert "holds a run that has not ended, at t = 0.8. Go on with it by --resume, begin anew by --overwrite" in error
     code, error = fails(capsys, *pieces, "--resume", "--seed", "5")
     assert code == 2
     assert "another scenario" in error
@@ -275,3 +282,23 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
         assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("pieces", "whole")]
     assert summaries[0]["measured"]["steps"] == summaries[1]["measured"]["steps"]
+    # The time of both legs counts, and the steps of both are divided by it.
+    assert summaries[0]["measured"]["step_seconds"] >= 0.6
+
+
+def test_info_describes_what_is_not_acceptable_too(real_mesh, tmp_path, capsys):
+    assert main(["info", str(real_mesh("moebius.obj"))]) == 0
+    said = capsys.readouterr().out
+    assert "not acceptable as it is: moebius.obj: The surface is not orientable" in said
+    assert "with --repair:" in said
+    assert "cut along" in said
+    (tmp_path / "a.obj").write_text("v 0 0 0\n")
+    code, error = fails(capsys, "info", str(tmp_path / "a.obj"))
+    assert code == 2
+    assert "no faces" in error
+
+
+def test_times_in_captions_are_numbers_as_people_write_them():
+    assert [run._short(t) for t in (0.0, 0.25, 1000.0, 40.0, 123456.0, 1e-5, 2e7)] == [
+        "0", "0.25", "1000", "40", "123000", "1e-05", "2e+07",
+    ]  # fmt: skip

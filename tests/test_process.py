@@ -127,7 +127,7 @@ def test_colours_of_a_mesh_file_are_denoised_and_pictures_drawn(tmp_path, ball, 
     out = tmp_path / "out"
     call("denoise", ball, "--out", out)
     assert {path.name for path in out.iterdir()} == {
-        "denoise.json", "denoise.ply", "denoise.vtp", "denoise-before.png", "denoise-after.png",
+        ".ltljax", "denoise.json", "denoise.ply", "denoise.vtp", "denoise-before.png", "denoise-after.png",
     }  # fmt: skip
     clean, before = noisy
     saved = trimesh.load(out / "denoise.ply", process=False)
@@ -238,7 +238,7 @@ def test_lines_of_a_field_are_drawn(tmp_path, sphere, field):
     out, egg = tmp_path / field, tmp_path / "egg.obj"
     files.write_obj(egg, sphere.vertices * [1, 1.5, 0.8], sphere.faces)
     call("lic", egg, "--field", field, "--resolution", "64", "--out", out)
-    assert {path.name for path in out.iterdir()} == {"lic.json", "lic.ply", "lic.vtp", "lic.png"}
+    assert {path.name for path in out.iterdir()} == {".ltljax", "lic.json", "lic.ply", "lic.vtp", "lic.png"}
     image = pytest.importorskip("imageio.v3").imread(out / "lic.png")
     assert image.shape == (64, 128)
     assert image.std() > 20
@@ -249,12 +249,12 @@ def test_no_file_of_the_user_is_replaced(tmp_path, ball, capsys, undrawn):
     (tmp_path / "out" / "curvature.ply").write_text("mine")
     code, said = fails(capsys, "curvature", ball, "--out", tmp_path / "out")
     assert code == 2
-    assert "which no such command has written" in said
+    assert "curvature.ply, which ltljax did not write" in said
     assert (tmp_path / "out" / "curvature.ply").read_text() == "mine"
     same = ball.rename(tmp_path / "smooth.ply")
     code, said = fails(capsys, "smooth", same, "--out", tmp_path)
     assert code == 2
-    assert "which the run reads" in said
+    assert "which is read" in said
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "obj", "ply"])
@@ -289,7 +289,7 @@ def test_vectors_by_name_keep_their_units(tmp_path):
         np.testing.assert_array_equal(images._column(tmp_path / "data.npz", name)[0], expected)
 
 
-def test_a_later_run_replaces_only_what_earlier_runs_have_written(tmp_path, ball, sphere, undrawn, capsys):
+def test_a_later_run_replaces_what_earlier_runs_have_written_and_nothing_else(tmp_path, ball, sphere, undrawn, capsys):
     out, plain = tmp_path / "out", tmp_path / "plain.obj"
     files.write_obj(plain, sphere.vertices, sphere.faces)
     fair = ("--method", "fair", "--out", out)
@@ -297,33 +297,40 @@ def test_a_later_run_replaces_only_what_earlier_runs_have_written(tmp_path, ball
     (out / "smooth.obj").write_text("mine")
     code, said = fails(capsys, "smooth", plain, *fair)
     assert code == 2
-    assert "smooth.obj, which no such command has written" in said
+    assert "smooth.obj, which ltljax did not write" in said
     assert (out / "smooth.obj").read_text() == "mine"
     (out / "smooth.obj").unlink()
     call("smooth", plain, *fair)
-    record = json.loads((out / "smooth.json").read_text())
-    assert record["files"] == ["smooth.vtp", "smooth.obj"]
-    assert record["earlier_files"] == ["smooth.ply"]
+    assert json.loads((out / "smooth.json").read_text())["files"] == ["smooth.obj", "smooth.vtp"]
+    # What belongs to the earlier results does not stand beside the new ones.
+    assert not (out / "smooth.ply").exists()
     call("smooth", ball, *fair)
+    assert not (out / "smooth.obj").exists()
 
 
-def test_files_are_named_in_the_marker_before_they_are_written(tmp_path, monkeypatch):
+def test_an_interrupted_command_leaves_the_results_of_the_one_before(tmp_path, monkeypatch):
     mesh, out = mapped(4), tmp_path / "out"
     path = tmp_path / "plane.obj"
     files.write_obj(path, mesh.vertices, mesh.faces, mesh.uv)
     monkeypatch.setattr(pictures, "can_draw", lambda: True)
 
+    def write(value):
+        command = results.Results("denoise", subject.load(str(path), False), out, ())
+        command.numbers({"u": np.full(mesh.num_vertices, value)})
+        command.textured(np.zeros((4, 4, 3), np.uint8))
+        command.finish({}, {})
+
+    monkeypatch.setattr(texture, "write_textured_obj", lambda path, *_: path.write_text("texture"))
+    write(1.0)
+    before = {entry.name: entry.read_bytes() for entry in out.rglob("*") if entry.is_file()}
+
     def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(texture, "write_textured_obj", stop)
-    written = results.Results("denoise", subject.load(str(path), False), out, ())
     with pytest.raises(KeyboardInterrupt):
-        written.textured(np.zeros((4, 4, 3), np.uint8))
-    names = [f"textured/denoise.{ending}" for ending in ("obj", "mtl", "png")]
-    assert json.loads((out / "denoise.json").read_text())["files"] == names
-    (out / "textured" / "denoise.png").write_text("half a picture")
-    results.Results("denoise", written.subject, out, ())
+        write(2.0)
+    assert {entry.name: entry.read_bytes() for entry in out.rglob("*") if entry.is_file()} == before
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 import json
 import tomllib
 import tracemalloc
+from pathlib import Path
 
+import imageio.v3
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -120,15 +122,15 @@ def test_results_replace_no_input_and_nothing_that_is_no_result(tmp_path, capsys
     text = PLAIN.replace('shape = "sphere"\nsubdivisions = 2', 'file = "my.ply"')
     (tmp_path / "my.toml").write_text(text)
     assert main(["run", "my.toml", "--out", "."]) == 2
-    assert "would replace my.ply, which the run reads" in capsys.readouterr().err
+    assert "would replace my.ply, which is read" in capsys.readouterr().err
     assert main(["run", "gray-scott", "--mesh", "my.ply", "--t1", "0.01", "--frames", "1", "--out", "other"]) == 0
     assert main(["run", "my.toml", "--out", "other"]) == 0  # of a run before it
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "my.glb").write_text("of the user")
     assert main(["run", "my.toml", "--out", "mine"]) == 2
-    assert "my.glb, which no run has written" in capsys.readouterr().err
+    assert "my.glb, which ltljax did not write" in capsys.readouterr().err
     assert main(["run", "other/scenario.toml", "--out", "other"]) == 2
-    assert "scenario.toml, which the run reads" in capsys.readouterr().err
+    assert "scenario.toml, which is read" in capsys.readouterr().err
     assert (tmp_path / "my.ply").read_bytes() == mesh
     assert (tmp_path / "other" / "inputs" / "mesh" / "my.ply").read_bytes() == mesh
     assert ltl.load_mesh(tmp_path / "other" / "my.ply").num_vertices == 200
@@ -214,8 +216,8 @@ BROKEN = {
     "null in a path": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "a\\u0000b"'), "mesh.file"),
     "folder as file": (changed('shape = "sphere"\nsubdivisions = 2', 'file = "."'), "a file that exists"),
     "state out of the folder": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "../start.npz"'), "own folder"),
-    "state that is no state": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "bad.npz"'), "an .npz file"),
-    "pickle": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "pickle.npz"'), "an .npz file"),
+    "state that is no state": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "bad.npz"'), "a CSV or .npz file"),
+    "pickle": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "pickle.npz"'), "a CSV or .npz file"),
     "negative diffusivity": (changed("u = 1.0", "u = -1.0"), "a diffusivity that is not negative"),
     "negative somewhere": (changed("u = 1.0", 'u = "x"'), "a diffusivity that is not negative"),
     "diffusivity of nobody": (changed("v = 10.0", "v = 10.0\nw = 3"), "diffusivity.w is not known"),
@@ -246,9 +248,9 @@ BROKEN = {
         changed('[kinetics]\nname = "schnakenberg"\nrate = 30.0', "[reactions]\n")
         .replace("[reactions]\n", "[reactions]\n" + "".join(f"ds{k} = 0\n" for k in range(100))), "at most 64 species",
     ),
-    "state of nothing": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "empty.npz"'), "an .npz file"),
-    "state cut short": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "cut.npz"'), "an .npz file"),
-    "state that is damaged": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "damaged.npz"'), "an .npz file"),
+    "state of nothing": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "empty.npz"'), "a CSV or .npz file"),
+    "state cut short": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "cut.npz"'), "a CSV or .npz file"),
+    "state that is damaged": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "damaged.npz"'), "a CSV or .npz file"),
     "state of another size": (changed('u = "1 + 0.1*noise"\nv = 0.9', 'file = "far.npz"'), "float64 of shape (500"),
     "no equation of Cahn and Hilliard": (
         changed('name = "schnakenberg"\nrate = 30.0', 'name = "cahn-hilliard"')
@@ -451,7 +453,7 @@ def test_numbers_of_a_file_are_found_from_files_of_data(kind, seen, tmp_path, ca
         assert abs(found["found"][key] - truth) < 3 * found["std"][key]
     assert found["noise"] == pytest.approx(1, abs=0.15)
     assert (out / "fit.png").stat().st_size > 10_000
-    assert not (out / "unknowns.npz").exists()
+    assert not (out / "restart").exists()
     fitted = tomllib.loads((out / "fitted.toml").read_text())
     assert fitted["kinetics"]["a"] == found["found"]["kinetics.a"]
     assert "fit" not in fitted
@@ -480,6 +482,8 @@ def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_
     left = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert not left["converged"]
     capsys.readouterr()
+    assert main(["fit", str(tmp_path / "on.toml"), *out]) == 2
+    assert "holds a fit that has not converged. Go on with it by --resume" in capsys.readouterr().err
     assert main(["fit", str(tmp_path / "other.toml"), "--resume", *out]) == 2
     assert "holds another fit: its data differ" in capsys.readouterr().err
     # With another start, whose place what was kept takes.
@@ -488,7 +492,7 @@ def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_
     assert found["converged"]
     assert found["loss"] < left["loss"]
     assert found["found"]["kinetics.a"] == pytest.approx(0.1, rel=0.05)
-    assert not (tmp_path / "out" / "unknowns.npz").exists()
+    assert not (tmp_path / "out" / "restart").exists()
 
 
 def test_a_fit_replaces_nothing_that_no_fit_has_written(seen, tmp_path, capsys):
@@ -498,12 +502,12 @@ def test_a_fit_replaces_nothing_that_no_fit_has_written(seen, tmp_path, capsys):
     (tmp_path / "fitted.toml").write_text(PLAIN.replace("rate = 30.0", "rate = 30.0\na = 0.13") + SOUGHT)
     before = (tmp_path / "fitted.toml").read_text()
     assert main(["fit", str(tmp_path / "fitted.toml"), "--out", str(tmp_path)]) == 2
-    assert "which the run reads" in capsys.readouterr().err
+    assert "which is read" in capsys.readouterr().err
     assert (tmp_path / "fitted.toml").read_text() == before
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "fit.json").write_text('{"of": "another program"}')
     assert main(["fit", str(tmp_path / "fitted.toml"), "--out", str(tmp_path / "out")]) == 2
-    assert "fit.json, which no fit has written" in capsys.readouterr().err
+    assert "fit.json, which ltljax did not write" in capsys.readouterr().err
 
 
 BROKEN_FITS = {
@@ -519,8 +523,12 @@ BROKEN_FITS = {
     "a time after the end": ("time = 0.05", "time = 0.5", "fit.data.time"),
     "another key": ("noise = 0.002", "noies = 0.002", "did you mean noise"),
     "data as a table": ('[[fit.data]]\nfile = "early.npz"\ntime = 0.05\n[[fit.data]]', "[fit.data]", "list of tables"),
-    "wrong length": ("early.npz", "short.npz", "162 finite values of u"),
-    "not a number": ("early.npz", "bad.npz", "162 finite values of u"),
+    "wrong length": ("early.npz", "short.npz", "162 values of u"),
+    "not a number": (
+        "early.npz",
+        "bad.npz",
+        "162 are missing or infinite (name the vertices of the others in a column vertex)",
+    ),
     "no species": ("early.npz", "other.npz", "columns or arrays named u or v"),
     "damaged": ("early.npz", "damaged.npz", "a sound file"),
     "vertex too large": ("early.npz", "far.csv", "vertices from 0 to 161, not 500"),
@@ -572,3 +580,65 @@ def test_a_scenario_runs_with_fixed_steps_of_sbdf2(tmp_path):
     )
     assert main(["run", str(tmp_path / "my.toml"), "--out", str(tmp_path / "out"), "--set", "time.end=0.01"]) == 0
     assert json.loads((tmp_path / "out/summary.json").read_text())["measured"]["reached_time"] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("name", ["gray-scott", "cahn-hilliard"])
+def test_the_scale_of_a_pattern_is_one_number(name):
+    mesh_of = {"mesh": {"shape": "sphere", "subdivisions": 2}}
+
+    def rate(scale, on):
+        example = scenario.read(scenario.library()[name], name, Path(), {**mesh_of, "scale": scale})
+        surface = ltl.Surface.from_mesh(on(example.mesh), dtype=jnp.float64)
+        equation = example.make_equation(surface)
+        u = np.random.default_rng(0).uniform(0.2, 0.8, example.u0.shape)
+        return np.asarray(equation.rate(jnp.zeros(()), surface, jnp.asarray(u)))
+
+    # On a sphere twice as large the same numbers make a pattern of twice the scale.
+    np.testing.assert_allclose(rate(2.0, lambda mesh: mesh.scaled(2.0)), rate(1.0, lambda mesh: mesh), rtol=1e-9)
+
+
+def test_the_side_seen_and_the_size_of_a_texture_are_chosen(tmp_path):
+    square = ltl.shapes.square(1.0, 12)
+    flat = square.vertices[:, :2] - square.vertices[:, :2].min(axis=0)
+    files.write_obj(tmp_path / "a.obj", square.vertices, square.faces, flat[square.faces])
+    arguments = ["run", "fisher-kpp", "--mesh", str(tmp_path / "a.obj"), "--frames", "1", "--t1", "0.01"]
+    out = tmp_path / "out"
+    assert main([*arguments, "--out", str(out), "--view", "top", "--texture", "64", "--scale", "0.5"]) == 0
+    assert imageio.v3.imread(out / "textured" / "fisher-kpp.png").shape == (64, 64, 3)
+    resolved = tomllib.loads((out / "scenario.toml").read_text())
+    assert (resolved["scale"], resolved["output"]["view"], resolved["output"]["texture"]) == (0.5, "top", 64)
+    # The square lies in the plane z = 0. Seen from above, along y, it is a line, and most of the picture is white.
+    assert (imageio.v3.imread(out / "fisher-kpp.png") > 250).all(axis=2).mean() > 0.9
+
+
+def test_a_start_is_read_from_a_table_of_a_spreadsheet(tmp_path):
+    mesh = scenario.read(PLAIN, "plain.toml", tmp_path).mesh
+    rows = "\n".join(f"{x:.17g},{2 * x:.17g}" for x in mesh.vertices[:, 0])
+    (tmp_path / "start.csv").write_text(f"v,u\n{rows}\n")
+    text = PLAIN.replace('u = "1 + 0.1*noise"\nv = 0.9', 'file = "start.csv"')
+    np.testing.assert_array_equal(
+        scenario.read(text, "mine.toml", tmp_path).u0, mesh.vertices[:, :1] * np.array([2.0, 1.0])
+    )
+    (tmp_path / "start.csv").write_text("v,w\n1,2\n")
+    with pytest.raises(ValueError, match=r"expected the column u, found v, w"):
+        scenario.read(text, "mine.toml", tmp_path)
+
+
+def test_a_command_names_a_mesh_anywhere_and_a_file_only_beside_it(tmp_path, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    mesh = ltl.shapes.icosphere(2)
+    files.write_obj(tmp_path / "elsewhere" / "a.obj", mesh.vertices, mesh.faces)
+    path = tmp_path / "elsewhere" / "a.obj"
+    (tmp_path / "plain.toml").write_text(PLAIN)
+    run = ["run", str(tmp_path / "plain.toml"), "--out", str(tmp_path / "out"), "--frames", "1"]
+    assert main([*run, "--set", f"mesh.file={path}"]) == 0
+    (tmp_path / "plain.toml").write_text(PLAIN.replace('shape = "sphere"\nsubdivisions = 2', f'file = "{path}"'))
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "plain.toml").rename(tmp_path / "inner" / "plain.toml")
+    assert main(["run", str(tmp_path / "inner" / "plain.toml"), "--out", str(tmp_path / "out2")]) == 2
+    assert "from elsewhere name it by --mesh" in capsys.readouterr().err
+
+
+def test_a_bound_that_means_zero_is_called_zero(tmp_path):
+    with pytest.raises(ValueError, match=r"expected a number above 0 as time\.end"):
+        scenario.read(PLAIN.replace("end = 0.1", "end = 0"), "mine.toml", tmp_path)

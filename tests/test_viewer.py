@@ -61,6 +61,14 @@ def test_a_uniform_state_and_one_time_are_enough(sphere):
     np.testing.assert_allclose(unpacked(page, 0), 3.0)
 
 
+def test_times_that_were_not_reached_are_left_out(sphere):
+    states = np.zeros((3, sphere.num_vertices))
+    states[2] = np.nan
+    page = viewer_html(sphere.vertices, sphere.faces, np.array([0.0, 1.0, np.inf]), {"u": states})
+    assert json.loads(part(page, "header"))["times"] == [0, 1]
+    assert unpacked(page, 0).shape == (2, sphere.num_vertices)
+
+
 def test_a_title_cannot_end_the_script_it_stands_in(sphere):
     times, fields = states(sphere)
     title = "</script><script>alert(1)</script> @bundle@ @data@"

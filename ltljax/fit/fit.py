@@ -1,6 +1,7 @@
 """`fit`: a model, a first guess and data become parameters with error bars. The door to optimistix."""
 
 import dataclasses
+import io
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +13,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
+from ..folder import Folder
 from ..progress import watched
-from ..solve.restart import RestartError, fingerprint
+from ..solve.fingerprint import fingerprint
+from ..solve.restart import RestartError
 from .methods import MANY, SETTLED, Marquardt
 from .observations import Observations
 from .problem import Model, Problem, Residuals, jacobian_of, prepare, steps_adaptively
@@ -192,6 +195,7 @@ def fit(
         ValueError: data and model do not go together, there are fewer values (and penalties) than unknowns, or the
             start is outside the range of its transforms.
         RestartError: the file to resume from is that of another fit, or damaged.
+        OutputError: ``checkpoint`` names a file that ltljax did not write.
         FitError: the model fails at the start.
     """
     space = unknowns(start, transforms)
@@ -199,6 +203,8 @@ def fit(
     keeper = None if checkpoint is None else _Checkpoint(Path(checkpoint), space, data)
     if keeper is not None and resume and keeper.path.exists():
         space, z, left = keeper.read()
+    if keeper is not None:
+        keeper.folder.check([keeper.path.name])
     problem = prepare(model, space, data, penalty, method, z, rtol, atol)
     converted = problem.converted(z)
     function = problem.function(converted, z)
@@ -326,25 +332,26 @@ class _Checkpoint:
 
     def __init__(self, path: Path, space: Unknowns, data: Observations):
         self.path, self.space, self.data = path, space, data
+        self.folder = Folder(path.parent)
         self.fit = {"data": fingerprint(data), "ranges of parameters": fingerprint(space.transforms)}
 
     def keep(self, z: Array, loss: float) -> None:
         """Write a step."""
-        draft = self.path.with_name(self.path.name + ".part")
         scales = np.array([float(scale) for scale in self.space.scales])
-        with draft.open("wb") as file:
-            np.savez(
-                file, unknowns=np.asarray(z), names=np.array(self.space.names), scales=scales, loss=loss,
-                fit=np.array(list(self.fit.values())),
-            )  # fmt: skip
-        draft.replace(self.path)
+        content = io.BytesIO()
+        np.savez(
+            content, unknowns=np.asarray(z), names=np.array(self.space.names), scales=scales, loss=loss,
+            fit=np.array(list(self.fit.values())),
+        )  # fmt: skip
+        with self.folder.locked(waits=True):
+            self.folder.write(self.path.name, content.getvalue())
 
     def read(self) -> tuple[Unknowns, Array, float]:
         """The unknowns with the scales they were left with, their vector, and the loss there."""
         try:
             with np.load(self.path, allow_pickle=False) as file:
                 kept = {name: file[name] for name in ("unknowns", "names", "scales", "loss", "fit")}
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        except (ValueError, KeyError, OSError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile):
             raise RestartError(f"{self.path} is damaged, or no file of a fit. {_ANEW}") from None
         if tuple(kept["names"]) != self.space.names:
             raise RestartError(

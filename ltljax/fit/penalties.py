@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..operators import gradient, laplacian
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 
 
+@on_surface
 def smoothness(
     surface: Surface,
     field: Float[AnyArray, " V"],
@@ -38,6 +39,7 @@ def smoothness(
     return root[:, None] * gradient(surface, field) if order == 1 else root * laplacian(surface, field)
 
 
+@on_surface
 def total_variation(
     surface: Surface,
     field: Float[AnyArray, " V"],

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..operators import integrate, laplacian
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 
 
@@ -42,6 +42,7 @@ class PatternStatistics(eqx.Module):
         return jnp.concatenate([jnp.stack([self.wavelength, self.mean, self.deviation, self.skewness]), self.coverage])
 
 
+@on_surface
 def pattern_statistics(
     surface: Surface,
     u: Float[AnyArray, " V"],

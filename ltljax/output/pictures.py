@@ -10,8 +10,17 @@ import numpy as np
 
 from .colors import colormap_samples
 
-# Both sides, a little from the right and from above; y is up, as in most mesh files.
-_VIEWS = ((0.55, 0.35, 1.0), (-0.55, 0.35, -1.0))
+# From where the left half of a picture looks, and what is up there; the right half looks from the opposite side. y is
+# up, as in most mesh files. Seen aslant, both halves look a little from above.
+VIEWS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "aslant": ((0.55, 0.35, 1.0), (0, 1, 0)),
+    "front": ((0, 0, 1), (0, 1, 0)),
+    "back": ((0, 0, -1), (0, 1, 0)),
+    "right": ((1, 0, 0), (0, 1, 0)),
+    "left": ((-1, 0, 0), (0, 1, 0)),
+    "top": ((0, 1, 0), (0, 0, -1)),
+    "bottom": ((0, -1, 0), (0, 0, 1)),
+}
 _SIZE = (1280, 640)
 _FRAMES_PER_SECOND = 20
 
@@ -30,6 +39,7 @@ class Picture:
         title: the name of the field, beside the colour bar.
         limits: the ends of the colour bar; None where what is drawn are colours, (V, 3) of unsigned bytes.
         colormap: one of `ltljax.output.colors.COLORMAPS`, or the samples (N, 3) of one.
+        view: one of `VIEWS`.
     """
 
     def __init__(
@@ -39,6 +49,7 @@ class Picture:
         title: str,
         limits: tuple[float, float] | None,
         colormap: str | np.ndarray = "viridis",
+        view: str = "aslant",
     ):
         import pyvista
 
@@ -50,9 +61,11 @@ class Picture:
         # Without a display VTK says so before it renders off-screen all the same.
         self._quiet = pyvista.vtk_verbosity
         with self._quiet("error"):
-            self._plotter = self._compose(pyvista.Plotter, limits, colormap)
+            self._plotter = self._compose(pyvista.Plotter, limits, colormap, view)
 
-    def _compose(self, plotter_class: Any, limits: tuple[float, float] | None, colormap: str | np.ndarray) -> Any:
+    def _compose(
+        self, plotter_class: Any, limits: tuple[float, float] | None, colormap: str | np.ndarray, view: str
+    ) -> Any:
         from matplotlib.colors import LinearSegmentedColormap  # which PyVista brings
 
         plotter = plotter_class(off_screen=True, window_size=list(_SIZE), shape=(1, 2), border=False)
@@ -62,7 +75,9 @@ class Picture:
             samples = colormap_samples(colormap) if isinstance(colormap, str) else colormap
             shades = LinearSegmentedColormap.from_list("samples", samples / 255, max(len(samples), 256))
             painted = dict(clim=limits, cmap=shades, n_colors=shades.N, interpolate_before_map=True)
-        for column, view in enumerate(_VIEWS):
+        (x, y, z), up = VIEWS[view]
+        opposite = (-x, y, -z) if view == "aslant" else (-x, -y, -z)
+        for column, direction in enumerate(((x, y, z), opposite)):
             plotter.subplot(0, column)
             plotter.set_background("white")
             plotter.add_mesh(
@@ -74,7 +89,7 @@ class Picture:
                 scalar_bar_args=dict(title=self._title, **bar),
                 **painted,
             )
-            plotter.view_vector(view, viewup=(0, 1, 0))
+            plotter.view_vector(direction, viewup=up)
         plotter.subplot(0, 0)
         return plotter
 

@@ -5,13 +5,14 @@ the mesh file.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..folder import Folder
 from .subject import Subject
 
 _NO_PICTURES = 'note: pictures need the extra "viz": pip install "ltljax[viz]"'
@@ -21,7 +22,7 @@ _SHOWN, _SHOWN_ABOUT_ZERO = 98, 90
 
 
 class Results:
-    """The folder of a command, which is made with the first file; before each the marker names it as the command's.
+    """The folder of a command, and what it is to hold: everything is written in the end, by `finish`.
 
     Args:
         command: its name, with which the names of all files begin.
@@ -31,60 +32,58 @@ class Results:
         inputs: the files that are read beside the mesh.
 
     Raises:
-        OutputError: results would replace what is read, or what no such command has written.
+        OutputError: results would replace what is read, or what ltljax has not written.
     """
 
     def __init__(self, command: str, subject: Subject, out: Path, pictures: Sequence[str], inputs: Sequence[Path] = ()):
-        from ..output import folder
         from ..output.pictures import can_draw
 
-        self.command, self.subject, self.out = command, subject, out
-        self.files: list[str] = []
-        self._before = folder.written_before(out, self.marker)[1:]
+        self.command, self.subject, self.folder = command, subject, Folder(out)
+        self._writers: dict[str, Callable[[Path], Any]] = {}
         self.draws = can_draw()
-        names = [f"{command}.{ending}" for ending in ("ply", "vtp", "obj")]
+        self._record_name = f"{command}.json"
+        names = [self._record_name, *(f"{command}.{ending}" for ending in ("ply", "vtp", "obj"))]
         names += [f"textured/{command}.{ending}" for ending in ("obj", "mtl", "png")]
         names += [self._picture(name) for name in pictures]
-        folder.check_results(out, self.marker, names, (*inputs, *([subject.path] if subject.path else [])))
+        self.folder.check(names, (*inputs, *([subject.path] if subject.path else [])))
+        self._possible = names
         mesh = subject.mesh
         self.vertices = subject.in_file_order(mesh.vertices)
         self.faces = np.argsort(mesh.source_order)[mesh.faces].astype(np.int32)
         print(f"{command} on {subject.name}: {mesh.num_vertices} vertices, {mesh.num_faces} faces")
 
-    @property
-    def marker(self) -> str:
-        """The name of the file that says what was done."""
-        return f"{self.command}.json"
-
     def numbers(self, fields: Mapping[str, Any], moved: np.ndarray | None = None) -> None:
-        """Write fields (V,) or (V, C) as VTP, on moved vertices if there are such."""
+        """Fields (V,) or (V, C) as VTP, on moved vertices if there are such."""
         from ..output.files import write_vtp
 
         ordered = {name: self.subject.in_file_order(np.asarray(values)) for name, values in fields.items()}
-        write_vtp(self._new(f"{self.command}.vtp"), self._placed(moved), self.faces, ordered)
+        vertices = self._placed(moved)
+        self._writers[f"{self.command}.vtp"] = lambda path: write_vtp(path, vertices, self.faces, ordered)
 
     def colors(self, colors: np.ndarray, moved: np.ndarray | None = None) -> None:
-        """Write the mesh as PLY with colours (V, 3) or (V, 4) of unsigned bytes."""
+        """The mesh as PLY with colours (V, 3) or (V, 4) of unsigned bytes."""
         from ..output.files import write_ply
 
-        write_ply(self._new(f"{self.command}.ply"), self._placed(moved), self.faces, self.subject.in_file_order(colors))
+        vertices, ordered = self._placed(moved), self.subject.in_file_order(colors)
+        self._writers[f"{self.command}.ply"] = lambda path: write_ply(path, vertices, self.faces, ordered)
 
     def shape(self, moved: np.ndarray, colors: np.ndarray | None = None) -> None:
-        """Write moved vertices and the faces as OBJ, with a UV map if there is one, and colours (V, 3) from 0 to 1."""
+        """Moved vertices and the faces as OBJ, with a UV map if there is one, and colours (V, 3) from 0 to 1."""
         from ..output.files import write_obj
 
-        path, uv = self._new(f"{self.command}.obj"), self.subject.mesh.uv
+        vertices, uv = self._placed(moved), self.subject.mesh.uv
         ordered = None if colors is None else self.subject.in_file_order(colors)
-        write_obj(path, self._placed(moved), self.faces, uv, colors=ordered)
+        self._writers[f"{self.command}.obj"] = lambda path: write_obj(path, vertices, self.faces, uv, colors=ordered)
 
     def textured(self, image: np.ndarray) -> None:
-        """Write the mesh as OBJ with an image (H, W, 3) of unsigned bytes; nothing where no image can be written."""
+        """The mesh as OBJ with an image (H, W, 3) of unsigned bytes; nothing where no image can be written."""
         from ..output.texture import write_textured_obj
 
         uv = self.subject.mesh.uv
         if self.draws and uv is not None:
-            path, *_ = (self._new(f"textured/{self.command}.{ending}") for ending in ("obj", "mtl", "png"))
-            write_textured_obj(path, self.vertices, self.faces, uv, image)
+            self._writers[f"textured/{self.command}.obj"] = lambda path: write_textured_obj(
+                path, self.vertices, self.faces, uv, image
+            )
 
     def picture(
         self,
@@ -95,7 +94,7 @@ class Results:
         colormap: str | np.ndarray = "viridis",
         moved: np.ndarray | None = None,
     ) -> None:
-        """Draw a field (V,) between limits, or without them colours (V, 3); nothing where nothing can be drawn."""
+        """A picture of a field (V,) between limits, or of colours (V, 3); nothing where none can be drawn."""
         from ..output import pictures
 
         if not self.draws:
@@ -107,43 +106,38 @@ class Results:
         self.image(name, image)
 
     def image(self, name: str, image: np.ndarray) -> None:
-        """Write pixels as PNG; nothing where none can be written."""
+        """Pixels as PNG; nothing where none can be written."""
         from ..output.pictures import write_png
 
         if self.draws:
-            write_png(self._new(self._picture(name)), image)
+            self._writers[self._picture(name)] = lambda path: write_png(path, image)
 
     def finish(self, options: Mapping[str, Any], measured: Mapping[str, Any]) -> None:
-        """Write the record, and say in short what came out."""
+        """Write all files and the record, and say in short what came out. What an earlier command of the same name
+        wrote, and this one does not, is removed."""
         for name, value in measured.items():
             if value is None:
                 continue
             print(f"{name.replace('_', ' '):32} {_readable(value)}")
         if not self.draws:
             print(_NO_PICTURES)
-        self._mark(options, measured)
-        print(f"{'written to':32} {self.out}: {', '.join([*self.files, self.marker])}")
-
-    def _mark(self, options: Mapping[str, Any], measured: Mapping[str, Any]) -> None:
-        record = dict(
-            command=self.command,
-            mesh=self.subject.name,
-            options=dict(options),
-            measured=dict(measured),
-            files=self.files,
-            earlier_files=[name for name in self._before if name not in self.files and (self.out / name).exists()],
-            versions={package: version(package) for package in ("ltljax", "jax", "numpy")},
-        )
-        (self.out / self.marker).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-
-    def _new(self, name: str) -> Path:
-        """Where a file goes."""
-        path = self.out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.files.append(name)
-        # First of all, so that what is left of an interrupted command may be replaced.
-        self._mark({}, {})
-        return path
+        with self.folder.locked():
+            with self.folder.draft() as draft:
+                for name, write in self._writers.items():
+                    (draft / name).parent.mkdir(parents=True, exist_ok=True)
+                    write(draft / name)
+                files = sorted(path.relative_to(draft).as_posix() for path in draft.rglob("*") if path.is_file())
+                record = dict(
+                    command=self.command,
+                    mesh=self.subject.name,
+                    options=dict(options),
+                    measured=dict(measured),
+                    files=files,
+                    versions={package: version(package) for package in ("ltljax", "jax", "numpy")},
+                )
+                (draft / self._record_name).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+            self.folder.remove(set(self._possible) - {*files, self._record_name})
+        print(f"{'written to':32} {self.folder.path}: {', '.join([*files, self._record_name])}")
 
     def _picture(self, name: str) -> str:
         return f"{self.command}-{name}.png" if name else f"{self.command}.png"

@@ -3,13 +3,14 @@
 from .paper import BUILT_IN, SCENARIOS, SOURCES
 from .reader import ScenarioError, read_text
 from .scenario import Options, Scenario, Settings
-from .written import SCHEMES, library, parse_change, read, title
+from .written import SCHEMES, VIEWS, library, parse_change, read, title
 
 __all__ = [
     "BUILT_IN",
     "SCENARIOS",
     "SCHEMES",
     "SOURCES",
+    "VIEWS",
     "Options",
     "Scenario",
     "ScenarioError",

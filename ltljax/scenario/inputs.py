@@ -13,6 +13,7 @@ from xml.parsers import expat
 import numpy as np
 
 from ..mesh import MeshError
+from ..mesh.columns import read_columns
 
 
 def check_self_contained(path: Path) -> None:
@@ -38,11 +39,19 @@ def check_self_contained(path: Path) -> None:
 
 
 def arrays(path: Path, names: tuple[str, ...], size: int) -> list[np.ndarray]:
-    """The arrays (V,) of an .npz file, which is told by its head what it holds before that is unpacked.
+    """The columns (V,) of a CSV file, or the arrays of an .npz file, whose heads are read before they are unpacked.
 
     Source: numpy.lib.format.
     """
     columns = []
+    if path.suffix.lower() == ".csv":
+        table = read_columns(path)
+        if absent := [name for name in names if name not in table]:
+            raise ValueError(f"expected the column {absent[0]}, found {', '.join(table)[:200]}")
+        columns = [table[name].astype(np.float64) for name in names]
+        if len(columns[0]) != size:
+            raise ValueError(f"expected {size} rows of numbers, found {len(columns[0])}")
+        return columns
     # Of sixteen bytes an entry at most, and a head.
     longest = 16 * size + 4096
     with zipfile.ZipFile(path) as archive:

@@ -83,8 +83,11 @@ def wanted(
         names, where = which, vertices
         size = mesh.num_vertices if here is None else len(here)
         for s in which:
-            if columns[s].shape != (size,) or not np.isfinite(columns[s]).all():
-                raise entry.error("file", f"{size} finite values of {s}, one for each vertex,")
+            if columns[s].shape != (size,):
+                raise entry.error("file", f"{size} values of {s}, one for each vertex,")
+            if missing := int(np.sum(~np.isfinite(columns[s]))):
+                way = "name the vertices of the others in a column vertex" if here is None else "leave those rows out"
+                raise entry.error("file", f"finite values of {s}; {missing} are missing or infinite ({way}),")
         state = np.stack([columns[s] for s in which], axis=1)
         if here is None:
             ordered = np.empty_like(state)

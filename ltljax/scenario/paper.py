@@ -22,6 +22,8 @@ def heat(options: Options) -> Scenario:
     """u_t = Delta u + g from u = 0 (section 3): g = x1, or on the torus a function of the poloidal angle."""
     if options.as_published:
         raise ValueError("--as-published belongs to turing; for heat on the torus see --source angle.")
+    if options.scale != 1:
+        raise ValueError("--scale is for patterns; heat makes none.")
     if options.boundary and options.mesh in ("sphere", "torus"):
         raise ValueError(f"--boundary needs a mesh with a boundary; the {options.mesh} is closed.")
     if options.mesh == "torus":
@@ -111,16 +113,17 @@ def turing(options: Options) -> Scenario:
     if options.boundary:
         raise ValueError("--boundary belongs to heat; through the boundary of turing nothing flows.")
     note: tuple[str, ...] = ()
+    scale = options.scale**2
     if options.mesh == "sphere":
         mesh = shapes.icosphere(subdivisions=5)
     elif options.mesh == "torus":
         mesh = shapes.torus(major=_MAJOR, minor=_MINOR, n_major=144, n_minor=72)
     else:
-        mesh, scale = _mesh_of(options)
-        note = (scale,)
+        mesh, says = _mesh_of(options)
+        note = (says,)
     if options.as_published:
         reaction = dict(rate=2.0, feed=16.0, decay=0.0)
-        diffusivity, start, noise, t1 = (1.0, 2.0), 1.0, 0.0, 20.0
+        diffusivity, start, noise, t1 = (1.0 * scale, 2.0 * scale), 1.0, 0.0, 20.0
         note += (
             "The published parameters (alpha = 1, beta = s = 2, gamma = 0, start at 1) make no pattern: without gamma "
             "no diffusivities can, so the state stays uniform and tends to (1, 16).",
@@ -128,7 +131,7 @@ def turing(options: Options) -> Scenario:
     else:
         # Turk's decay of 12 gives spots that run together into stripes; at 11 they stay apart.
         reaction = dict(rate=10.0, feed=16.0, decay=11.0)
-        diffusivity, start, noise, t1 = (0.8, 0.1), 4.0, 0.1, 40.0
+        diffusivity, start, noise, t1 = (0.8 * scale, 0.1 * scale), 4.0, 0.1, 40.0
         note += ("Where v falls below 0.05 its sink fades to zero, which keeps v from turning negative.",)
     rng = np.random.default_rng(options.seed)
     decay = np.full(mesh.num_vertices, reaction["decay"])

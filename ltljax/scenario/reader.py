@@ -125,6 +125,8 @@ class Table:
         if isinstance(value, bool) or not isinstance(value, int | float) or not _is_within(value, least, most):
             bounds = f" from {least:g} to {most:g}" if math.isfinite(least + most) else ""
             bounds = bounds or (f" of at least {least:g}" if math.isfinite(least) else "")
+            # The least number that is not lost counts as zero.
+            bounds = bounds if not 0 < least < 1e-200 else " above 0"
             raise self.error(key, f"a number{bounds}")
         return self._take(key, float(value))
 
@@ -212,7 +214,8 @@ class Table:
         except (OSError, ValueError, RuntimeError):
             raise self.error(key, "the name of a file") from None
         if not path.is_relative_to(inside):
-            raise self.error(key, f"a file in the scenario's own folder, {folder}, or below it")
+            other = "; from elsewhere name it by --mesh" if self.name(key) == "mesh.file" else ""
+            raise self.error(key, f"a file in the scenario's own folder, {folder}, or below it{other}")
         if not is_file:
             raise self.error(key, "the name of a file that exists")
         return path

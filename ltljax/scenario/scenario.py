@@ -28,6 +28,8 @@ class Settings:
         dt: the length of fixed steps; None for adaptive ones.
         show: the species that pictures show.
         colormap: the name of their colours.
+        view: from where pictures look, one of `ltljax.output.pictures.VIEWS`.
+        texture: pixels of an edge of the image that the mesh's UV map leads to.
         displacement: how far the largest value of ``show`` is raised above the least in a surface written for that;
             zero for none.
     """
@@ -41,6 +43,8 @@ class Settings:
     dt: float | None = None
     show: str = "u"
     colormap: str = "viridis"
+    view: str = "aslant"
+    texture: int = 1024
     displacement: float = 0.0
 
 
@@ -57,6 +61,7 @@ class Options:
         repair: mend a mesh file that is not acceptable.
         seed: of the random numbers.
         t1: the end of the run; None for the scenario's own.
+        scale: of `turing`, how many times as large its pattern is.
     """
 
     mesh: str = "sphere"
@@ -67,6 +72,7 @@ class Options:
     repair: bool = False
     seed: int = 0
     t1: float | None = None
+    scale: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,7 @@ from ..equations import CahnHilliard, Diffusion, Equation, ReactionDiffusion, ki
 from ..formulas import Formula, cut
 from ..mesh import Mesh, MeshError, load_mesh, shapes
 from ..output.colors import COLORMAPS
+from ..output.pictures import VIEWS
 from ..solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
 from ..surface import Surface
 from .inputs import arrays, check_self_contained
@@ -118,7 +119,8 @@ def read(
     seed = root.count("seed", 0, 0, 2**63 - 1)
     mesh, used, note = _mesh(root.table("mesh"), folder if mesh_file is None else mesh_file.parent)
     place = _places(root.table("bumps"), mesh, seed)
-    make_equation, species, numbers = _equation(root, mesh, place)
+    scale = root.number("scale", 1.0, 1e-3, 1e3)
+    make_equation, species, numbers = _equation(root, mesh, place, scale)
     time = root.table("time")
     end = time.number("end", 10.0, least=1e-300)
     frames = time.count("frames", 60, 1, 10_000)
@@ -287,26 +289,36 @@ def _written_reaction(table: Table, parameters: Table, place) -> tuple[_Reaction
     return reaction, species, _numbers("parameters", values)
 
 
-def _cahn_hilliard(table: Table) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
+def _cahn_hilliard(table: Table, scale: float) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
     width, mobility = table.number("width", 0.05, 1e-6, 1e3), table.number("mobility", 1.0, 0, 1e6)
     table.finish()
     values = dict(width=width, mobility=mobility)
 
     def make_equation(surface: Surface, free: _Free = MappingProxyType({})) -> Equation:
-        given = [jnp.asarray(free.get(f"kinetics.{key}", value), surface.dtype) for key, value in values.items()]
-        return CahnHilliard(*given)
+        given = {key: jnp.asarray(free.get(f"kinetics.{key}", value), surface.dtype) for key, value in values.items()}
+        return CahnHilliard(scale * given["width"], scale**2 * given["mobility"])
 
     return make_equation, ("u",), _numbers("kinetics", values)
 
 
-def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
+def _equation(
+    root: Table, mesh: Mesh, place, scale: float
+) -> tuple[Callable[..., Equation], tuple[str, ...], dict[str, float]]:
+    """How to make the equation, its species, and its numbers by dotted key.
+
+    Args:
+        root: all tables.
+        mesh: where.
+        place: what evaluates a formula at every vertex.
+        scale: how many times as large patterns are: lengths in diffusivities and velocities grow with it.
+    """
     table, reactions = root.table("kinetics"), root.table("reactions")
     if reactions.names():
         if table.names():
             raise root.error("kinetics", "either [kinetics] with a name or [reactions] with formulas, not both,")
         reaction, species, numbers = _written_reaction(reactions, root.table("parameters"), place)
     elif table.choice("name", (*KINETICS, "cahn-hilliard")) == "cahn-hilliard":
-        return _cahn_hilliard(table)
+        return _cahn_hilliard(table, scale)
     else:
         reaction, species, numbers = _named_reaction(table, place)
     diffusion = root.table("diffusivity")
@@ -326,10 +338,12 @@ def _equation(root: Table, mesh: Mesh, place) -> tuple[Callable[..., Equation], 
     if any(loop >= len(mesh.boundary_loops) for loop in loops):
         raise boundary.error("conditions", f"conditions for a mesh with {len(mesh.boundary_loops)} boundary loops")
 
+    scaled_flow = None if flow is None else scale * flow
+
     def make_equation(surface: Surface, free: _Free = MappingProxyType({})) -> Equation:
-        given = [free.get(f"diffusivity.{s}", d) for s, d in zip(species, spreads, strict=True)]
+        given = [scale**2 * free.get(f"diffusivity.{s}", d) for s, d in zip(species, spreads, strict=True)]
         spread = [
-            _operator(surface, d, direction if direction and s in direction[2] else None, flow)
+            _operator(surface, d, direction if direction and s in direction[2] else None, scaled_flow)
             for s, d in zip(species, given, strict=True)
         ]
         return ReactionDiffusion(spread, reaction(surface.dtype, free), boundary=conditions)
@@ -422,7 +436,7 @@ def _operator(surface: Surface, diffusivity, direction, flow) -> Any:
 
 
 def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Path) -> tuple[np.ndarray, Path | None]:
-    """The initial state (V, S), from formulas or from a file of arrays in the order of the mesh file."""
+    """The initial state (V, S), from formulas or from a file of numbers in the order of the mesh file."""
     if "file" not in table:
         columns = [np.broadcast_to(_field(table, s, place), mesh.num_vertices) for s in species]
         table.finish()
@@ -433,7 +447,7 @@ def _start(table: Table, mesh: Mesh, place, species: tuple[str, ...], folder: Pa
         columns = arrays(path, species, mesh.num_vertices)
     except Exception as error:  # damaged archives raise anything; here all mean the same
         reason = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
-        raise table.error("file", f"an .npz file with arrays {listed(species)} ({reason})") from None
+        raise table.error("file", f"a CSV or .npz file with {listed(species)} ({reason})") from None
     state = np.empty((mesh.num_vertices, len(species)))
     for s, column in zip(species, columns, strict=True):
         if not np.isfinite(column).all():
@@ -464,6 +478,8 @@ def _settings(root: Table, species: tuple[str, ...]) -> Settings:
         dt=dt or None,
         show=output.choice("show", species, species[0]),
         colormap=output.choice("colormap", tuple(COLORMAPS), "viridis"),
+        view=output.choice("view", tuple(VIEWS), "aslant"),
+        texture=output.count("texture", 1024, 16, 16384),
         displacement=output.number("displacement", 0.0, -1e3, 1e3),
     )
     solver.finish()

@@ -4,187 +4,125 @@ What enters: a folder and a description of the run. What leaves: the states kept
 """
 
 import dataclasses
-import functools
-import hashlib
+import io
 import json
-import os
-import types
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import diffrax
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..folder import Folder
 from ..tables import AnyArray
 from .steps import without_twins
 
 _RUN = "run.json"
-# States that stand whether they were asked for or not: the last, and the one to make it again from.
+_ANEW = "Begin again in another folder."
+# The number of states that are always kept: the last one, and the one before it, from which it can be recomputed.
 _LAST = 2
 
 
 class RestartError(ValueError):
-    """The files of a folder belong to another run, or are damaged."""
-
-
-def fingerprint(value: Any) -> str:
-    """A short text that differs where the value does, the same in every process: arrays by their bytes, functions by
-    their code and what of their module and surroundings they read, other objects by their type and state."""
-    digest = hashlib.sha256()
-    _feed(digest.update, value, {})
-    return digest.hexdigest()[:16]
-
-
-def _feed(update: Callable[[bytes], None], value: Any, seen: dict[int, Any]) -> None:
-    def tell(text: str) -> None:
-        update(f"{text}\0".encode())
-
-    def feed(*parts: Any) -> None:
-        for part in parts:
-            _feed(update, part, seen)
-
-    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
-        tell(repr(value))
-        return
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        value = jax.random.key_data(value)
-    if isinstance(value, np.ndarray | jax.Array | np.generic):
-        array = np.asarray(value)
-        tell(f"{array.dtype}{array.shape}")
-        update(np.ascontiguousarray(array).tobytes())
-        return
-    if isinstance(value, tuple | list):
-        tell(f"{len(value)} of")
-        feed(*value)
-        return
-    if isinstance(value, set | frozenset):  # whose order differs from process to process
-        tell(f"set of {sorted(map(fingerprint, value))}")
-        return
-    if isinstance(value, Mapping):
-        tell(f"{len(value)} by name")
-        for key in sorted(value, key=str):
-            tell(str(key))
-            feed(value[key])
-        return
-    if isinstance(value, types.CodeType):
-        tell(value.co_code.hex())
-        feed(value.co_names, value.co_consts)
-        return
-    if id(value) in seen:  # what names itself, by way of others
-        return
-    seen[id(value)] = value
-    if isinstance(value, type | types.ModuleType | types.BuiltinFunctionType | np.ufunc):
-        tell(f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', value.__name__)}")
-        if isinstance(value, type) and value.__module__ == "__main__":
-            feed({name: own for name, own in vars(value).items() if isinstance(own, types.FunctionType)})
-    elif isinstance(value, types.FunctionType):
-        tell(f"{value.__module__}.{value.__qualname__}")
-        feed(value.__code__, value.__defaults__, value.__kwdefaults__, list(_enclosed(value)), _read_by(value))
-    elif isinstance(value, types.MethodType):
-        feed(value.__func__, value.__self__)
-    elif isinstance(value, functools.partial):
-        feed(value.func, value.args, value.keywords)
-    elif isinstance(value, eqx.Module):
-        feed(type(value), {name: getattr(value, name) for name in value.__dataclass_fields__})
-    elif hasattr(value, "__wrapped__"):  # such as what jit makes of a function
-        feed(value.__wrapped__)
-    else:
-        feed(type(value), _state_of(value))
-
-
-def _enclosed(function: types.FunctionType) -> Iterator[Any]:
-    """The values of a function's surroundings that it names."""
-    for cell in function.__closure__ or ():
-        try:
-            yield cell.cell_contents
-        except ValueError:  # not given yet
-            yield None
-
-
-def _read_by(function: types.FunctionType) -> dict[str, Any]:
-    """What a function, or one made within it, reads of its module: values, and functions and classes of the same."""
-
-    def names(code: types.CodeType) -> set[str]:
-        within = (names(part) for part in code.co_consts if isinstance(part, types.CodeType))
-        return set(code.co_names).union(*within)
-
-    found = {name: function.__globals__[name] for name in names(function.__code__) if name in function.__globals__}
-    elsewhere = types.ModuleType | types.FunctionType | types.BuiltinFunctionType | type
-    return {
-        name: value
-        for name, value in found.items()
-        if not isinstance(value, elsewhere) or getattr(value, "__module__", None) == function.__module__
-    }
-
-
-def _state_of(value: Any) -> Any:
-    """What an object is beside its type, as it would be copied."""
-    try:
-        made = value.__reduce_ex__(2)
-    except TypeError:  # such as a lock, which has none
-        return None
-    return made if isinstance(made, str) else [list(part) if isinstance(part, Iterator) else part for part in made[1:]]
+    """The files of a folder belong to another run, or to one that has not ended, or are damaged."""
 
 
 class Keeper:
-    """The folder of a run: the run's description, and one file for each state with the record that belongs to it.
+    """The states of a run in a folder: the run's description, and one file for each state with its record.
 
-    At any moment every file is whole. States that are not to be kept for good go when two later ones are there, so
-    that neither the folder nor what is written at a time grows with the length of a run.
+    Every file is either complete or absent, and is recorded as ltljax's own. A state that is not kept for good is
+    removed once two later ones exist, so that neither the folder nor what is written at a time grows with the
+    length of a run. A state that was damaged or changed is passed over, and stays.
 
     Args:
-        folder: where; made if absent.
+        folder: where; locked.
         run: what the run is, as fingerprints by name; a run may only go on from files of the same.
-        resume: whether to go on from what is there; otherwise it is removed.
+        resume: whether to go on from what is there; otherwise the states of a run that has ended are removed.
+        within: the part of the folder that holds the states.
+        overwrite: whether to remove the states of a run that has not ended, too.
+        ways: what can be done about a run that has not ended, as a sentence.
 
     Attributes:
         done: the records of the states that are kept, in order.
+        passed_over: the files of states that were damaged or changed.
 
     Raises:
-        RestartError: the files are those of another run, or damaged.
+        RestartError: the files are those of another run, or damaged; or of a run that has not ended, and it is neither
+            to go on nor to be removed.
+        OutputError: files that ltljax has not written have the names of its own.
     """
 
-    def __init__(self, folder: str | Path, run: Mapping[str, str], resume: bool):
-        self.folder = Path(folder)
+    def __init__(
+        self,
+        folder: Folder,
+        run: Mapping[str, str],
+        resume: bool,
+        within: str = "",
+        overwrite: bool = False,
+        ways: str = "Go on with resume=True, remove the folder, or name another one.",
+    ):
+        self.folder, self._run, self._within = folder, dict(run), f"{within}/" if within else ""
         self.done: list[dict[str, Any]] = []
+        self.passed_over: list[Path] = []
         self._files: list[tuple[int, bool]] = []  # the number of each state, and whether it is kept for good
-        if not resume and self.folder.exists():
-            self._clear()
-        self.folder.mkdir(parents=True, exist_ok=True)
-        if (self.folder / _RUN).exists():
-            self._check(dict(run))
+        description = self._within + _RUN
+        if resume and (folder.path / description).exists():
+            self._check(description)
             self._read()
-        else:
-            self._write(self.folder / _RUN, lambda file: file.write(json.dumps(dict(run)).encode()))
+            return
+        if resume and _states(folder, self._within):
+            raise RestartError(
+                f"{folder.path / within} holds states, but not {_RUN}, which says what run made them. {_ANEW}"
+            )
+        if not overwrite and (end := _unfinished(folder, self._within)) is not None:
+            raise RestartError(f"{folder.path / within} holds a run that has not ended{end}. {ways}")
+        # All is known to be ltljax's own before anything is removed.
+        there = sorted((folder.path / within).glob("state_*.npz"))
+        folder.check([description, *(self._within + path.name for path in there)])
+        folder.remove([description, *_states(folder, self._within)])
+        folder.write(description, json.dumps(dict(run=self._run, has_ended=False)).encode())
 
-    def _check(self, run: dict[str, str]) -> None:
-        path = self.folder / _RUN
-        try:
-            found = dict(json.loads(path.read_text()))
-        except (ValueError, TypeError) as error:
-            raise RestartError(f"{path} is damaged: {error}. Start the run anew without resume.") from error
-        differing = [name for name in run if found.get(name) != run[name]]
+    def _check(self, description: str) -> None:
+        path = self.folder.path / description
+        if not self.folder.owns(description):
+            raise RestartError(f"{path} was damaged, changed, or not written by ltljax. {_ANEW}")
+        found = _description(self.folder, self._within)["run"]
+        differing = [name for name in self._run if found.get(name) != self._run[name]]
         if differing:
             raise RestartError(
-                f"The files in {self.folder} belong to a run with another {', another '.join(differing)}. Repeat that "
-                "run as it was, take another folder, or start anew without resume."
+                f"The files in {path.parent} belong to a run with another {', another '.join(differing)}. Repeat that "
+                "run as it was, or name another folder."
             )
 
     def _read(self) -> None:
-        for path in sorted(self.folder.glob("state_*.npz")):
-            record = json.loads(self._load(path, "record").item())
-            self.done.append(record["record"])
-            self._files.append((int(path.stem.removeprefix("state_")), record["for_good"]))
+        for path in sorted((self.folder.path / self._within).glob("state_*.npz")):
+            found = self._load(path)
+            if found is None or found["run"] != self._run:
+                self.passed_over.append(path)
+                continue
+            self.done.append(found["record"])
+            self._files.append((int(path.stem.removeprefix("state_")), found["for_good"]))
+
+    def _load(self, path: Path) -> dict[str, Any] | None:
+        """What a state's file holds beside the state; None where it is not what was written."""
+        if not self.folder.owns(self._within + path.name):
+            return None
+        with np.load(path, allow_pickle=False) as arrays:
+            return json.loads(arrays["record"].item())
 
     def state(self, index: int) -> np.ndarray:
-        """The state of one of the records."""
-        return self._load(self._path(self._files[index][0]), "state")
+        """The state of one of the records.
+
+        Raises:
+            RestartError: its file was damaged since.
+        """
+        name = self._name(self._files[index][0])
+        if not self.folder.owns(name):
+            raise RestartError(f"{self.folder.path / name} was damaged or removed while it was in use. {_ANEW}")
+        with np.load(self.folder.path / name, allow_pickle=False) as arrays:
+            return arrays["state"]
 
     def states(self) -> list[np.ndarray]:
         """The states kept so far, in order."""
@@ -193,51 +131,63 @@ class Keeper:
     def keep(self, state: np.ndarray, record: dict[str, Any], *, for_good: bool = True) -> None:
         """Put a state on disk with its record, for good or until two later ones are there."""
         number = self._files[-1][0] + 1 if self._files else 0
-        text = np.asarray(json.dumps(dict(record=record, for_good=for_good)))
-        self._write(self._path(number), lambda file: np.savez(file, state=state, record=text))
+        while (self.folder.path / self._name(number)).exists() and not self.folder.owns(self._name(number)):
+            number += 1  # what was passed over stays
+        text = np.asarray(json.dumps(dict(run=self._run, record=record, for_good=for_good)))
+        content = io.BytesIO()
+        np.savez(content, state=state, record=text)
+        self.folder.write(self._name(number), content.getvalue())
         self.done.append(record)
         self._files.append((number, for_good))
         for index in reversed(range(len(self._files) - _LAST)):
             number, is_for_good = self._files[index]
             if not is_for_good:
-                self._path(number).unlink(missing_ok=True)
+                self.folder.remove([self._name(number)])
                 del self.done[index], self._files[index]
 
     def take_back(self) -> None:
-        """Count the last state as not made; its file stands until the next takes its place."""
+        """Forget the last state; its file stays until the next state overwrites it."""
         self.done.pop()
         self._files.pop()
 
+    def keep_first(self, count: int) -> None:
+        """Remove all states but the first ones, from which the rest are made again."""
+        self.folder.remove([self._name(number) for number, _ in self._files[count:]])
+        del self.done[count:], self._files[count:]
+
+    def end(self) -> None:
+        """Note that the run has ended: another one may take its place."""
+        self.folder.write(self._within + _RUN, json.dumps(dict(run=self._run, has_ended=True)).encode())
+
     def remove(self) -> None:
-        """Remove the folder: the run has ended, and its results are elsewhere."""
-        self._clear()
-        if not any(self.folder.iterdir()):
-            self.folder.rmdir()
+        """Remove the states: the run has ended, and its results are elsewhere."""
+        self.folder.remove([self._within + _RUN, *_states(self.folder, self._within)])
 
-    def _clear(self) -> None:
-        # Only what is ours: the folder may hold other things.
-        for path in [*self.folder.glob("state_*.npz"), *self.folder.glob("*.unfinished"), self.folder / _RUN]:
-            path.unlink(missing_ok=True)
+    def _name(self, number: int) -> str:
+        return f"{self._within}state_{number:06d}.npz"
 
-    def _path(self, number: int) -> Path:
-        return self.folder / f"state_{number:06d}.npz"
 
-    @staticmethod
-    def _load(path: Path, name: str) -> np.ndarray:
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as found:
-                return found[name]
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise RestartError(f"{path} is missing or damaged. Start the run anew without resume.") from error
+def _states(folder: Folder, within: str) -> list[str]:
+    """The names of the states in a part of a folder that are ltljax's own."""
+    names = sorted((folder.path / within).glob("state_*.npz"))
+    return [within + path.name for path in names if folder.owns(within + path.name)]
 
-    @staticmethod
-    def _write(path: Path, save: Callable[[Any], Any]) -> None:
-        unfinished = path.with_suffix(".unfinished")
-        with open(unfinished, "wb") as file:
-            save(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
+
+def _description(folder: Folder, within: str) -> dict[str, Any]:
+    return json.loads((folder.path / within / _RUN).read_text(encoding="utf-8"))
+
+
+def _unfinished(folder: Folder, within: str) -> str | None:
+    """How far a run is that has states and has not ended, for a message; None if there is none.
+
+    States whose description is damaged or gone count as such a run.
+    """
+    states = _states(folder, within)
+    if not states or (folder.owns(within + _RUN) and _description(folder, within)["has_ended"]):
+        return None
+    with np.load(folder.path / states[-1], allow_pickle=False) as arrays:
+        record = json.loads(arrays["record"].item())["record"]
+    return f", at t = {record['t']:g}" if "t" in record else ""
 
 
 def in_intervals(
@@ -277,6 +227,10 @@ def in_intervals(
     if keeper.done and (keeper.done[-1]["interval"] == len(ends) - 1 or keeper.done[-1]["is_over"]):
         # Nothing is left to do but to say how it ended: the last interval is repeated.
         keeper.take_back()
+    # Where a state that was asked for is damaged or gone, the run goes on from before it.
+    there = {0, *(record["interval"] for record in keeper.done)}
+    absent = [place for place in places.tolist() if place not in there]
+    keeper.keep_first(sum(record["interval"] < min(absent, default=len(ends)) for record in keeper.done))
     last: dict[str, Any] = keeper.done[-1] if keeper.done else dict(interval=0, counts={})
     u = jnp.asarray(keeper.state(-1)) if keeper.done else u0
     kept = {0: np.asarray(u0)} | {
@@ -284,10 +238,6 @@ def in_intervals(
         for index, record in enumerate(keeper.done)
         if record["interval"] in places
     }
-    if absent := sorted({int(place) for place in places if place <= last["interval"]} - set(kept)):
-        raise RestartError(
-            f"The state at t = {ends[absent[0]]:g} is missing in {keeper.folder}. Start the run anew without resume."
-        )
     solution: Any = None
     for interval in range(last["interval"] + 1, len(ends)):
         begin, end = ends[interval - 1], ends[interval]
@@ -305,6 +255,7 @@ def in_intervals(
         if is_over:
             break
     assert solution is not None  # the last interval is always advanced
+    keeper.end()
     reached = (np.abs(ends[places] - asked) <= slack) & (ends[places] <= last["t"])
     never = np.full(u0.shape, np.nan, u0.dtype)
     us = [kept[place] if has else never for place, has in zip(places.tolist(), reached, strict=True)]

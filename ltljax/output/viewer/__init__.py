@@ -44,7 +44,7 @@ def viewer_html(
     Args:
         vertices: (V, 3).
         faces: (F, 3).
-        times: (T,) ascending.
+        times: (T,) ascending; states at infinite times, which a run has not reached, are left out.
         fields: (T, V) for each species by name.
         title: what stands at the top.
         colormap: the one it opens with, of `ltljax.output.colors.COLORMAPS`.
@@ -55,6 +55,8 @@ def viewer_html(
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     times = np.asarray(times, np.float64)
     colormap_samples(colormap)
+    is_reached = np.isfinite(times)
+    num_states, times = len(times), times[is_reached]
     if not fields or len(times) == 0:
         raise ValueError("Expected at least one species at one time, found none.")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -66,9 +68,9 @@ def viewer_html(
     room_for_each = (max(_PAGE, _LETTERS * len(vertices) * len(times)) - sum(map(len, arrays.values()))) / len(fields)
     species = []
     for index, (name, values) in enumerate(fields.items()):
-        if np.shape(values) != (len(times), len(vertices)):
-            raise ValueError(f"Expected {name} of shape {(len(times), len(vertices))}, found {np.shape(values)}.")
-        limits, whole = _quantised(np.asarray(values))
+        if np.shape(values) != (num_states, len(vertices)):
+            raise ValueError(f"Expected {name} of shape {(num_states, len(vertices))}, found {np.shape(values)}.")
+        limits, whole = _quantised(np.asarray(values)[is_reached])
         steps, arrays[f"field-{index}"] = _packed(whole, room_for_each)
         species.append(dict(name=name, low=limits[0], high=limits[1], steps=steps))
     header = dict(

@@ -1,0 +1,157 @@
+"""Whatever lies in a folder of results, every byte that ltljax has not written is still there after every command."""
+
+import functools
+import os
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ltljax as ltl
+from ltljax.cli import main
+from ltljax.folder import OutputError
+from ltljax.output import files
+
+FITTED = """
+[mesh]
+shape = "sphere"
+subdivisions = 1
+[kinetics]
+name = "fisher-kpp"
+[initial]
+u = "0.5 + 0.3*x"
+[time]
+end = 0.1
+frames = 1
+[fit]
+free = ["kinetics.rate"]
+[[fit.data]]
+file = "seen.npz"
+time = 0.1
+"""
+
+
+def commands(inputs):
+    """Everything that writes a folder, by name: a call with the folder, which returns an exit code."""
+    mesh = ltl.shapes.icosphere(2)
+    files.write_obj(inputs / "mesh.obj", mesh.vertices, mesh.faces)
+    (inputs / "mine.toml").write_text(FITTED)
+    np.savez(inputs / "seen.npz", u=0.55 + 0.3 * ltl.shapes.icosphere(1).vertices[:, 0])
+    np.savez(inputs / "data.npz", u=mesh.vertices[:, 0])
+    obj, toml = str(inputs / "mesh.obj"), str(inputs / "mine.toml")
+
+    def kept(folder):
+        surface = ltl.Surface.from_mesh(mesh)
+        try:
+            ltl.solve(ltl.Diffusion(), surface, surface.vertices[:, 0], 0.1, dt=0.05, checkpoint_dir=folder)
+        except OutputError:
+            return 2
+        return 0
+
+    def fitted(folder):
+        def model(params):
+            return params["a"] * jnp.arange(5.0)
+
+        try:
+            ltl.fit(model, {"a": 1.0}, ltl.Observations(2 * jnp.arange(5.0)), checkpoint=folder / "unknowns.npz")
+        except OutputError:
+            return 2
+        return 0
+
+    lines = {
+        "run": ["run", "heat", "--mesh", obj, "--frames", "1", "--t1", "0.01"],
+        "run a file": ["run", toml],
+        "fit": ["fit", toml],
+        "denoise": ["denoise", obj, "--data", str(inputs / "data.npz")],
+        "smooth": ["smooth", obj, "--method", "fair"],
+        "lic": ["lic", obj, "--field", "rotation", "--resolution", "64"],
+        "curvature": ["curvature", obj],
+        "distance": ["distance", obj, "--from", "0"],
+    }
+    made = {name: lambda folder, line=line: main([*line, "--out", str(folder)]) for name, line in lines.items()}
+    return made | {"solve": kept, "ltl.fit": fitted}
+
+
+@functools.cache
+def names_of(inputs, name):
+    """What a command writes into an empty folder, besides its manifest and its lock."""
+    folder = inputs / f"empty-{name}"
+    assert commands(inputs)[name](folder) == 0
+    return {path for path in tree(folder) if not path.startswith(".ltljax/")}
+
+
+def all_names(inputs):
+    return set().union(*(names_of(inputs, name) for name in ALL))
+
+
+def tree(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def seeded(folder, names, seed):
+    """200 files of somebody else, with these names among them."""
+    random = np.random.default_rng(seed)
+    used = [f"restart/state_{number:06d}.npz" for number in range(40)]
+    used += [f"state_{number:06d}.npz" for number in range(40)] + ["unknowns.npz", "restart/unknowns.npz", "run.json"]
+    used += [
+        "restart/run.json",
+        "manifest.json",
+        "lock",
+        "inputs/mesh/mesh.obj",
+        "notes.txt",
+        "state_000000.unfinished",
+    ]
+    wanted = [*names, *random.permutation(used)]
+    wanted += [f"{random.integers(1 << 30)}.{ending}" for ending in ("npz", "json", "vtp", "png") for _ in range(50)]
+    for name in list(dict.fromkeys(wanted))[:200]:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(random.bytes(random.integers(0, 200)))
+    return tree(folder)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    return tmp_path_factory.mktemp("inputs")
+
+
+ALL = ["run", "run a file", "fit", "denoise", "smooth", "lic", "curvature", "distance", "solve", "ltl.fit"]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_folder_full_of_foreign_files_is_refused_and_stays(inputs, tmp_path, capsys, name):
+    before = seeded(tmp_path, sorted(all_names(inputs)), 1)
+    assert len(before) == 200
+    capsys.readouterr()
+    assert commands(inputs)[name](tmp_path) == 2
+    after = tree(tmp_path)
+    assert {path: after[path] for path in before} == before
+    assert {path for path in after.keys() - before.keys() if not path.startswith(".ltljax/")} == set()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_each_name_alone_is_refused_by_its_name(inputs, tmp_path, capsys, name):
+    for index, own in enumerate(sorted(names_of(inputs, name))):
+        folder = tmp_path / str(index)
+        (folder / own).parent.mkdir(parents=True)
+        (folder / own).write_bytes(b"mine")
+        capsys.readouterr()
+        assert commands(inputs)[name](folder) == 2, own
+        assert (folder / own).read_bytes() == b"mine"
+        if name not in ("solve", "ltl.fit"):
+            assert os.path.basename(own) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_foreign_files_of_other_names_stay_beside_the_results(inputs, tmp_path, name):
+    own = names_of(inputs, name)
+    others = all_names(inputs) - own
+    folders = {path.split("/")[0] for path in own if "/" in path}
+    before = seeded(tmp_path, sorted(other for other in others if other.split("/")[0] not in folders), 2)
+    mine = {path for path in before if path in own or path.startswith(("restart/", "state_", "run.json"))}
+    for path in mine | {path for path in before if path in ("unknowns.npz",)}:
+        (tmp_path / path).unlink()
+        del before[path]
+    assert commands(inputs)[name](tmp_path) == 0
+    after = tree(tmp_path)
+    assert {path: after[path] for path in before} == before
+    assert own <= after.keys()
