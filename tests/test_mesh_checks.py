@@ -8,6 +8,7 @@ import pytest
 
 import ltljax as ltl
 from ltljax.mesh import Mesh, MeshError, one_rings, shapes
+from ltljax.mesh.report import face_areas
 
 
 @pytest.fixture
@@ -149,13 +150,18 @@ def test_a_moebius_strip_and_a_klein_bottle_are_named_non_orientable():
     width = np.tile([-0.3, 0.3], n)
     radius = 1 + width * np.cos(angle / 2)
     vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), width * np.sin(angle / 2)], axis=1)
-    for repair in (False, True):
-        with pytest.raises(MeshError, match=r"not orientable: .* those at edge \(\d+, \d+\) do not") as caught:
-            Mesh(vertices, faces, repair=repair)
+    with pytest.raises(MeshError, match=r"not orientable: .* the two at edge \(\d+, \d+\) disagree") as caught:
+        Mesh(vertices, faces)
     a, b = map(int, re.findall(r"\((\d+), (\d+)\)", str(caught.value))[0])
     assert {tuple(sorted((a, b)))} <= {
         tuple(sorted(e)) for f in faces.tolist() for e in zip(f, f[1:] + f[:1], strict=True)
     }
+    # Cut across once, it is a twisted strip: one boundary, and two vertices more.
+    mended = Mesh(vertices, faces, repair=True)
+    assert (mended.num_vertices, mended.num_faces, len(mended.boundary_loops)) == (2 * n + 2, 2 * n, 1)
+    assert [text.split(" (")[0] for text in mended.report.repairs] == [
+        "cut along 1 edge where the surface was one-sided"
+    ]
     # A torus lattice whose rows are reflected where they meet again. Its positions are random: only the faces matter.
     i, j = np.divmod(np.arange(36), 6)
 
@@ -164,7 +170,12 @@ def test_a_moebius_strip_and_a_klein_bottle_are_named_non_orientable():
 
     quads = [at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)]
     klein = np.concatenate([np.stack([quads[k] for k in corners], axis=1) for corners in ([0, 1, 2], [0, 2, 3])])
-    refused("not orientable", np.random.default_rng(0).normal(size=(36, 3)), klein)
+    positions = np.random.default_rng(0).normal(size=(36, 3))
+    refused("not orientable", positions, klein)
+    mended = Mesh(positions, klein, repair=True)
+    assert (mended.num_faces, mended.report.components) == (72, 1)
+    assert mended.boundary_loops
+    assert mended.area == pytest.approx(face_areas(positions, klein).sum())
 
 
 @pytest.mark.parametrize("repair", [False, True])

@@ -1,17 +1,27 @@
 """Every format gives the same surface, real meshes give their known counts, and damaged files give a `MeshError`."""
 
 import base64
+import gzip
 import importlib.util
 import json
+import os
+import resource
+import sys
 import time
+import warnings
+import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mesh_files import WRITERS, damaged
 
-from ltljax.mesh import Mesh, MeshError, load_mesh, one_rings, shapes
+from ltljax.mesh import Mesh, MeshError, load_mesh, one_rings, readers, shapes
+from ltljax.mesh.polygons import triangulated
 
 
 def written(folder: Path, name: str, data: bytes | str) -> Path:
@@ -400,3 +410,293 @@ def test_damaged_files_give_a_mesh_or_a_mesh_error(tmp_path):
     assert accepted + refused == 200
     assert accepted > 10
     assert refused > 50
+
+
+def area_of(points, triangles):
+    corners = points[triangles]
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 14))
+def test_a_polygon_of_any_shape_is_covered_once_by_its_triangles(seed, count):
+    chance = np.random.default_rng(seed)
+    angle = (np.arange(count) + chance.uniform(0.1, 0.9, count)) * 2 * np.pi / count
+    place = chance.uniform(0.05, 1, count) * np.exp(1j * angle)
+    turn, _ = np.linalg.qr(chance.normal(size=(3, 3)))
+    points = np.roll(np.stack([place.real, place.imag, 0 * angle], axis=1) @ turn.T, chance.integers(count), axis=0)
+    triangles = triangulated(points, np.arange(count), [count])
+    exact = 0.5 * np.imag(np.conj(place) * np.roll(place, -1)).sum()
+    assert area_of(points, triangles).sum() == pytest.approx(exact)
+    assert sorted(np.unique(triangles)) == list(range(count))
+
+
+def test_corners_on_a_straight_side_stay_corners_of_triangles_with_an_area():
+    points = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 2, 0], [1, 2, 0], [0, 2, 0]], float)
+    for shift in range(6):
+        moved = np.roll(points, shift, axis=0)
+        triangles = triangulated(moved, np.arange(6), [6])
+        assert area_of(moved, triangles).min() > 0.5
+        assert area_of(moved, triangles).sum() == pytest.approx(4)
+
+
+def test_a_polygon_that_crosses_itself_is_refused_by_its_number():
+    angle = np.arange(5) * 4 * np.pi / 5
+    star = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    with pytest.raises(MeshError, match="face 1 crosses itself"):
+        triangulated(star, [0, 1, 2, 0, 1, 2, 3, 4], [3, 5])
+
+
+@pytest.mark.parametrize(("name", "area"), [("l_prism.obj", 14), ("l_prism.off", 14), ("dart.obj", 25)])
+def test_faces_that_are_not_convex_keep_their_area(name, area, case_file):
+    assert load_mesh(case_file(name)).area == pytest.approx(area)
+
+
+@pytest.mark.parametrize("name", [
+    "glued_head.off", "lower_head.off", "bom.off", "no_head.off", "wrapped.off", "int64.ply", "upper_types.ply",
+    "tristrips.ply", "sphere.gii.gz", "sphere.obj.gz", "lh.pial",
+])  # fmt: skip
+def test_files_load_as_programs_write_them(name, case_file):
+    mesh = load_mesh(case_file(name))
+    assert (mesh.num_vertices, mesh.num_faces) == (162, 320)
+    assert mesh.is_closed
+    assert mesh.report.reoriented_faces == 0
+
+
+def test_a_file_that_announces_less_than_it_holds_is_refused(case_file, tmp_path):
+    with pytest.raises(MeshError, match="more rows than its head announces, by 20"):
+        load_mesh(case_file("announces_fewer.ply"))
+    text = "OFF\n4 3 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+    with pytest.raises(MeshError, match="by 1\\."):
+        load_mesh(written(tmp_path, "less.off", text))
+
+
+def in_every_format(shape, folder):
+    """The shape as a file of every kind that is read, by ending."""
+    pyvista, meshio, nibabel = (pytest.importorskip(name) for name in ("pyvista", "meshio", "nibabel"))
+    for name in ("a.vtk", "a.vtu"):
+        meshio.Mesh(shape.vertices, [("triangle", shape.faces)]).write(folder / name)
+    meshio.Mesh(shape.vertices, [("triangle", shape.faces)]).write(folder / "a.msh", file_format="gmsh22")
+    surface = pyvista.PolyData.from_regular_faces(shape.vertices, shape.faces)
+    for name in ("b.vtk", "a.vtp"):
+        surface.save(str(folder / name))
+    arrays = [
+        nibabel.gifti.GiftiDataArray(shape.vertices.astype(np.float32), intent="NIFTI_INTENT_POINTSET"),
+        nibabel.gifti.GiftiDataArray(shape.faces.astype(np.int32), intent="NIFTI_INTENT_TRIANGLE"),
+    ]
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays), folder / "a.gii")
+    nibabel.freesurfer.write_geometry(folder / "lh.pial", shape.vertices, shape.faces)
+    rows = [f"{x} {y} {z} 0" for x, y, z in shape.vertices] + [f"{a} {b} {c} 0" for a, b, c in shape.faces]
+    written(folder, "a.asc", f"#!ascii\n{shape.num_vertices} {shape.num_faces}\n" + "\n".join(rows) + "\n")
+    inside = "data:application/octet-stream;base64," + base64.b64encode(gltf_buffer()).decode()
+    written(folder, "a.gltf", gltf(inside))
+    written(folder, "a.obj.gz", gzip.compress(WRITERS["obj"][1](shape.vertices, shape.faces)))
+    others = [(path.name.split(".", 1)[1], path.read_bytes()) for path in folder.iterdir()]
+    return others + [(ending, write(shape.vertices, shape.faces)) for ending, write in WRITERS.values()]
+
+
+@pytest.mark.slow
+def test_three_thousand_damaged_files_of_every_format_stay_within_their_bounds(tmp_path):
+    """Each is a mesh or an error in one line, within 4 GB and 20 s."""
+    random = np.random.default_rng(20261129)
+    (tmp_path / "good").mkdir()
+    good = in_every_format(shapes.icosphere(1), tmp_path / "good")
+    paths = [
+        written(tmp_path, f"{index}.{good[index % len(good)][0]}", damaged(good[index % len(good)][1], random))
+        for index in range(3000)
+    ]
+
+    def outcome(path):
+        began = time.perf_counter()
+        try:
+            load_mesh(path)
+            message = ""
+        except MeshError as error:
+            message = str(error)
+        assert time.perf_counter() - began < 20, path
+        assert message == "" or (message.isprintable() and "SystemExit" not in message), message
+        return message
+
+    with ThreadPoolExecutor(2) as pool:
+        messages = list(pool.map(outcome, paths))
+    assert 300 < sum(message == "" for message in messages) < 2500
+    for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
+        assert resource.getrusage(who).ru_maxrss < 4e6  # in kilobytes
+
+
+def test_a_packed_file_that_is_damaged_is_one_sentence(tmp_path):
+    with pytest.raises(MeshError, match="could not be read as OBJ"):
+        load_mesh(written(tmp_path, "a.obj.gz", b"\x1f\x8b nothing"))
+
+
+def test_freesurfers_text_is_read(tmp_path):
+    shape = shapes.icosphere(1)
+    rows = [f"{x} {y} {z} 0" for x, y, z in shape.vertices] + [f"{a} {b} {c} 0" for a, b, c in shape.faces]
+    text = f"#!ascii version of lh.pial\n{shape.num_vertices} {shape.num_faces}\n" + "\n".join(rows) + "\n"
+    mesh = load_mesh(written(tmp_path, "lh.pial.asc", text))
+    np.testing.assert_allclose(mesh.vertices, shape.vertices)
+
+
+def test_vertices_that_rounding_has_split_are_one(case_file):
+    sphere = load_mesh(case_file("near_twins.stl"))
+    assert (sphere.num_vertices, sphere.num_faces, sphere.is_closed) == (162, 320, True)
+    assert sphere.report.welded_vertices == 960 - 162
+    cylinder = load_mesh(case_file("sewn_cylinder.obj"))
+    assert (cylinder.num_vertices, [len(loop) for loop in cylinder.boundary_loops]) == (216, [24, 24])
+    assert cylinder.num_vertices - len(cylinder.edges) + cylinder.num_faces == 0
+
+
+@pytest.mark.parametrize(("gap", "is_closed"), [(1e-12, True), (1e-5, True), (0.01, False)])
+def test_what_is_welded_follows_the_lengths_of_edges(gap, is_closed):
+    sphere = shapes.icosphere(2)
+    for scale in (1e-6, 1.0, 1e6):
+        corners = scale * sphere.vertices[sphere.faces].reshape(-1, 3)
+        moved = corners + scale * gap * np.random.default_rng(0).uniform(-1, 1, corners.shape)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        if is_closed:
+            mesh = Mesh(moved, faces, weld=True)
+            assert (mesh.num_vertices, mesh.is_closed) == (162, True)
+        else:
+            with pytest.raises(MeshError):
+                Mesh(moved, faces, weld=True)
+            assert Mesh(moved, faces, weld=0.04 * scale).num_vertices == 162
+
+
+def test_a_pool_of_threads_loads_what_a_row_of_calls_does(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    ball = shapes.icosphere(1)
+    paths = [
+        written(tmp_path, f"{kind}{index}.{ending}", write(ball.vertices * (index + 1), ball.faces))
+        for index in range(27)
+        for kind, (ending, write) in WRITERS.items()
+    ]
+    arrays = [
+        nibabel.gifti.GiftiDataArray(ball.vertices.astype(np.float32), intent="NIFTI_INTENT_POINTSET"),
+        nibabel.gifti.GiftiDataArray(ball.faces.astype(np.int32), intent="NIFTI_INTENT_TRIANGLE"),
+    ]
+    for index in range(4):
+        nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays), tmp_path / f"{index}.gii")
+        paths.append(tmp_path / f"{index}.gii")
+    streams, filters = (sys.stdout, sys.stderr), list(warnings.filters)
+    with ThreadPoolExecutor(32) as pool:
+        together = list(pool.map(load_mesh, paths))
+    assert (sys.stdout, sys.stderr) == streams
+    assert list(warnings.filters) == filters
+    for path, mesh in zip(paths, together, strict=True):
+        alone = load_mesh(path) if path.suffix != ".gii" or path.stem == "0" else mesh
+        np.testing.assert_array_equal(mesh.vertices, alone.vertices)
+        np.testing.assert_array_equal(mesh.faces, alone.faces)
+
+
+@pytest.mark.parametrize("spelt", ["ExternalFileBinary", "&#69;xternalFileBinary"])
+def test_a_gifti_file_reads_no_other_file(tmp_path, spelt):
+    pytest.importorskip("nibabel")
+    written(tmp_path, "secret.bin", np.arange(9, dtype="<f4").tobytes())
+    array = (
+        '<DataArray Intent="NIFTI_INTENT_POINTSET" DataType="NIFTI_TYPE_FLOAT32" ArrayIndexingOrder="RowMajorOrder" '
+        f'Dimensionality="2" Dim0="3" Dim1="3" Encoding="{spelt}" Endian="LittleEndian" '
+        'ExternalFileName="secret.bin" ExternalFileOffset="0"><Data></Data></DataArray>'
+    )
+    text = f'<?xml version="1.0"?><GIFTI Version="1.0" NumberOfDataArrays="1">{array}</GIFTI>'
+    with pytest.raises(MeshError, match="another file, which is not read"):
+        load_mesh(written(tmp_path, "a.gii", text))
+
+
+def test_a_gltf_file_reads_no_file_of_another_folder(tmp_path):
+    (tmp_path / "inner").mkdir()
+    written(tmp_path, "data.bin", gltf_buffer())
+    with pytest.raises(MeshError, match="outside the file's own folder"):
+        load_mesh(written(tmp_path / "inner", "a.gltf", gltf("../data.bin")))
+    os.mkfifo(tmp_path / "inner" / "pipe.bin")
+    with pytest.raises(MeshError, match="missing"):
+        load_mesh(written(tmp_path / "inner", "a.gltf", gltf("pipe.bin")))
+
+
+def test_a_small_file_that_asks_for_much_memory_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("meshio")
+    monkeypatch.setattr(readers, "_MEMORY", 6e8)
+    zeros = zlib.compress(bytes(1 << 29), 9)
+    head = np.array([1, 1 << 29, 0, len(zeros)], "<u4").tobytes()
+    data = base64.b64encode(head).decode() + base64.b64encode(zeros).decode()
+    text = (
+        '<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" header_type="UInt32" '
+        'compressor="vtkZLibDataCompressor"><UnstructuredGrid><Piece NumberOfPoints="44739242" NumberOfCells="0">'
+        f'<Points><DataArray type="Float32" NumberOfComponents="3" format="binary">{data}</DataArray></Points>'
+        '<Cells><DataArray type="Int32" Name="connectivity" format="ascii"></DataArray></Cells>'
+        "</Piece></UnstructuredGrid></VTKFile>"
+    )
+    with pytest.raises(MeshError, match=r"far more memory than a file of its size should"):
+        load_mesh(written(tmp_path, "bomb.vtu", text))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="bounds the time of computing by the operating system")
+def test_a_file_that_takes_too_long_to_read_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("pyvista")
+    monkeypatch.setattr(readers, "_SECONDS", 2)
+    attributes = " ".join(f'a{index}="1"' for index in range(150_000))
+    with pytest.raises(MeshError, match=r"slow\.vtp: .*was stopped after"):
+        load_mesh(written(tmp_path, "slow.vtp", f"<VTKFile {attributes}></VTKFile>"))
+
+
+@pytest.mark.parametrize("name", ["\x1b[31mred.obj", "two\nlines.obj"])
+def test_messages_hold_no_control_characters(tmp_path, name):
+    path = written(tmp_path, name, "v 0 0 \x1b[2J\n")
+    with pytest.raises(MeshError) as caught:
+        load_mesh(path)
+    assert str(caught.value).isprintable()
+
+
+def test_a_thin_wall_keeps_its_two_sides():
+    plate = shapes.box(sides=(10.0, 10.0, 5e-5), n=4)
+    mesh = Mesh(plate.vertices, plate.faces, weld=True)
+    assert mesh.num_vertices == plate.num_vertices
+    assert mesh.is_closed
+
+
+def test_a_fine_part_beside_a_coarse_one_is_welded_in_no_time():
+    fine, coarse = shapes.icosphere(5), shapes.icosphere(1, radius=1e5)
+    vertices = np.concatenate([fine.vertices[fine.faces].reshape(-1, 3), coarse.vertices[coarse.faces].reshape(-1, 3)])
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    mesh = Mesh(vertices + 1e-12 * np.random.default_rng(0).normal(size=vertices.shape), faces, weld=True)
+    assert mesh.num_vertices == fine.num_vertices + coarse.num_vertices
+
+
+@pytest.mark.parametrize("weld", [1, None, "yes", -1.0, np.nan])
+def test_a_distance_of_welding_is_a_positive_number_or_a_flag(weld):
+    sphere = shapes.icosphere(1)
+    with pytest.raises(ValueError, match="weld"):
+        Mesh(sphere.vertices, sphere.faces, weld=weld)
+
+
+def test_a_polygon_of_many_corners_is_covered_once():
+    angle = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    radius = 1 + 0.3 * np.cos(50 * angle)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    triangles = triangulated(points, np.arange(1000), [1000])
+    assert area_of(points, triangles).sum() == pytest.approx(
+        0.5 * abs(np.sum(points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)))
+    )
+
+
+def test_a_polygon_that_winds_around_a_corner_or_runs_back_on_itself_is_refused():
+    turns = np.radians([0, 100, 200, 300, 400])
+    spiral = np.concatenate([[[0, 0]], (np.linspace(1, 1.4, 5) * np.stack([np.cos(turns), np.sin(turns)])).T])
+    spike = np.array([[0, 0], [2, 0], [2, 1], [3, 1], [2, 1], [2, 2], [0, 2.0]])
+    for corners in (spiral, spike):
+        points = np.c_[corners, np.zeros(len(corners))]
+        with pytest.raises(MeshError, match="face 0 crosses itself"):
+            triangulated(points, np.arange(len(points)), [len(points)])
+
+
+@pytest.mark.parametrize("head", ["OFF", "COFF", "NOFF"])
+def test_off_numbers_may_flow_over_lines(tmp_path, head):
+    shape = shapes.icosphere(1)
+    extra = {"OFF": "", "COFF": " 255 0 0 255", "NOFF": " 0 0 1"}[head]
+    rows = [f"{x!r} {y!r} {z!r}{extra}" for x, y, z in shape.vertices.tolist()]
+    rows += [f"3 {a} {b} {c}" for a, b, c in shape.faces.tolist()]
+    text = f"{head}\n{shape.num_vertices} {shape.num_faces} 0\n" + "\n".join(
+        " ".join(rows[index : index + 2]) for index in range(0, len(rows), 2)
+    )
+    mesh = load_mesh(written(tmp_path, "a.off", text))
+    np.testing.assert_array_equal(mesh.vertices, shape.vertices)
+    np.testing.assert_array_equal(mesh.faces, shape.faces)

@@ -8,7 +8,8 @@ from . import shapes
 from .errors import MeshError
 from .files import load_mesh
 from .mesh import Mesh
-from .report import MeshReport, corner_angles, far_middle
+from .objects import as_mesh, vertex_data
+from .report import MeshReport, corner_angles, far_middle, vertex_normals
 from .topology import OneRings, half_edges, k_ring, one_rings, shared_edges
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "MeshError",
     "MeshReport",
     "OneRings",
+    "as_mesh",
     "corner_angles",
     "far_middle",
     "half_edges",
@@ -24,4 +26,6 @@ __all__ = [
     "one_rings",
     "shapes",
     "shared_edges",
+    "vertex_data",
+    "vertex_normals",
 ]

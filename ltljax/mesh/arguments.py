@@ -1,5 +1,6 @@
 """Are sizes, counts and arrays usable? Numbers enter; numbers or a sentence leave."""
 
+import inspect
 import operator
 from typing import Any
 
@@ -10,8 +11,12 @@ def as_numbers(name: str, value: Any) -> Any:
     """The value, if as an array of real numbers it loses nothing.
 
     Raises:
+        TypeError: it is no array, but a function, a mapping or a set.
         ValueError: it is a masked array, or one of dates, text, complex numbers or objects.
     """
+    if isinstance(value, dict | set) or inspect.isroutine(value):
+        kind = "a function" if inspect.isroutine(value) else f"a {type(value).__name__}"
+        raise TypeError(f"Expected {name} as real numbers, found {kind}.")
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(
             f"Expected {name} as a plain array, found a masked one, whose mask would be lost. Fill it with "

@@ -12,9 +12,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy.sparse.csgraph
+from scipy.spatial import KDTree
 
+from .arguments import not_negative
 from .errors import MeshError
-from .orientation import turned_faces
+from .orientation import disagreeing, turned_faces
 from .report import face_areas, face_edge_lengths
 from .topology import components, half_edges, shared_edges, undirected_keys, used_vertices
 
@@ -22,6 +25,8 @@ from .topology import components, half_edges, shared_edges, undirected_keys, use
 LARGEST_LENGTH, SMALLEST_LENGTH = 1e60, 1e-60
 # A face this thin, area against the square of its longest edge, has no normal that rounding has not made up.
 THINNEST_FACE = 1e-14
+# Vertices closer than this fraction of the shortest edge at either one are taken as a single vertex split by rounding.
+_TWIN = 1e-4
 # Second derivatives take five neighbours, so every connected piece needs five vertices beside the one in question.
 FEWEST_VERTICES = 6
 
@@ -53,14 +58,14 @@ class Checked:
     repairs: tuple[str, ...]
 
 
-def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
+def check(vertices: Any, faces: Any, *, repair: bool, weld: bool | float) -> Checked:
     """The checked mesh of arbitrary arrays.
 
     Args:
         vertices: (V, 3) positions.
         faces: (F, 3) vertex indices.
         repair: mend what can be mended, instead of raising.
-        weld: merge vertices at exactly the same position.
+        weld: True merges vertices that coincide up to rounding; a distance merges all vertices within it.
 
     Raises:
         MeshError: with the first thing found wrong.
@@ -74,6 +79,7 @@ def check(vertices: Any, faces: Any, *, repair: bool, weld: bool) -> Checked:
     work.check_duplicates()
     work.check_edges()
     work.check_fans()
+    work.cut_where_one_sided()
     work.check_components()
     reoriented = work.orient()
     if repair and work.repairs:
@@ -135,6 +141,63 @@ def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
         return vertices.astype(np.float64), faces.astype(np.int64)
 
 
+def _first_of_twins(vertices: np.ndarray, faces: np.ndarray, distance: float | None) -> np.ndarray | None:
+    """For every vertex the first one that lies within a distance of it; None where no two do.
+
+    Rounding opens edges that two faces shared, so where no distance is given only the ends of edges of a single face
+    are merged. The two sides of a thin wall stay apart.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3), whose vertices count.
+        distance: by default a ten-thousandth of the shortest edge at either of the two.
+    """
+    if not len(faces):
+        return None
+    used = used_vertices(faces, len(vertices)) if distance is not None else _open_vertices(faces, len(vertices))
+    if not len(used):
+        return None
+    lengths = face_edge_lengths(vertices, faces)
+    reach = np.full(len(vertices), np.inf)
+    for corner in range(3):  # both edges of a corner
+        for edge in (corner, (corner - 1) % 3):
+            np.minimum.at(reach, faces[:, corner], lengths[:, edge])
+    reach = reach[used] * _TWIN if distance is None else np.full(len(used), distance)
+    largest = float(reach.max())
+    if not 0 < largest < np.inf:
+        return None
+    tree, points = KDTree(vertices[used]), vertices[used]
+    # Each vertex looks as far as its own reach: one coarse part must not make a fine one look at all of itself.
+    crowded = np.flatnonzero(tree.query_ball_point(points, reach, return_length=True) > 1)
+    near = tree.query_ball_point(points[crowded], reach[crowded])
+    counts = np.array([len(others) for others in near], np.int64)
+    others = np.array([other for each in near for other in each], np.int64)
+    pairs = np.stack([np.repeat(crowded, counts), others], axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    pairs = pairs[apart <= reach[pairs].min(axis=1)]
+    if not len(pairs):
+        return None
+    graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    lowest = np.full(group.max() + 1, len(vertices))
+    np.minimum.at(lowest, group, used)
+    first = np.arange(len(vertices))
+    first[used] = lowest[group]
+    return first
+
+
+def _open_vertices(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """The vertices at edges that belong to one face only, ascending."""
+    directed = half_edges(faces)
+    _, edge, count = np.unique(undirected_keys(directed, num_vertices), return_inverse=True, return_counts=True)
+    return np.unique(directed[count[edge] == 1])
+
+
+def _counted(count: int, noun: str, nouns: str) -> str:
+    return f"{count} {noun if count == 1 else nouns}"
+
+
 class _Workpiece:
     """The mesh under inspection: arrays that the checks replace, and the list of repairs."""
 
@@ -154,7 +217,7 @@ class _Workpiece:
         if not self.repair:
             raise MeshError(message(int(np.flatnonzero(is_bad)[0])))
         self.faces, self.corners = self.faces[~is_bad], self.corners[~is_bad]
-        self.repairs.append(f"dropped {count} {'face' if count == 1 else 'faces'} {what}")
+        self.repairs.append(f"dropped {_counted(count, 'face', 'faces')} {what}")
         if not len(self.faces):
             raise MeshError(f"Repair left no faces: {'; '.join(self.repairs)}. The source holds no usable surface.")
 
@@ -202,18 +265,29 @@ class _Workpiece:
         # Minus zero and zero are one position.
         self.vertices = self.vertices + 0.0
 
-    def merge_vertices(self, weld: bool) -> np.ndarray:
+    def merge_vertices(self, weld: bool | float) -> np.ndarray:
         """Lets faces refer to the first of the vertices at each position; returns it, or -1 where unused, (V,)."""
         used = used_vertices(self.faces, len(self.vertices))
         representative = np.full(len(self.vertices), -1, dtype=np.int64)
         representative[used] = used
-        if weld:
-            positions = self.vertices[used]
-            order = np.lexsort(positions.T)  # stable, so the first of equals comes first
-            is_new = np.ones(len(order), bool)
-            is_new[1:] = np.any(positions[order[1:]] != positions[order[:-1]], axis=1)
-            representative[used[order]] = used[order[is_new]][np.cumsum(is_new) - 1]
-            self.faces = representative[self.faces]
+        if isinstance(weld, bool | np.bool_):
+            distance = None
+        elif isinstance(weld, int | str) or weld is None:
+            raise MeshError(f"Expected weld as True, False or a distance such as 1e-6, found {weld!r}.")
+        else:
+            distance = not_negative("weld", weld)
+        if weld is False or weld is np.False_:
+            return representative
+        positions = self.vertices[used]
+        order = np.lexsort(positions.T)  # stable, so the first of equals comes first
+        is_new = np.ones(len(order), bool)
+        is_new[1:] = np.any(positions[order[1:]] != positions[order[:-1]], axis=1)
+        representative[used[order]] = used[order[is_new]][np.cumsum(is_new) - 1]
+        self.faces = representative[self.faces]
+        first = _first_of_twins(self.vertices, self.faces, distance)
+        if first is not None:
+            representative[used] = first[representative[used]]
+            self.faces = first[self.faces]
         return representative
 
     def check_degenerate(self) -> None:
@@ -295,8 +369,33 @@ class _Workpiece:
 
     def check_fans(self) -> None:
         """The faces at each vertex form one fan; splitting gives every further fan a vertex of its own."""
+        split = self._fans(np.zeros(0, bool))
+        if split:
+            self.repairs.append(f"split {_counted(split, 'vertex', 'vertices')} where separate fans touched")
+
+    def cut_where_one_sided(self) -> None:
+        """Repair cuts components that are not orientable open, along curves where their faces disagree."""
+        if not self.repair:
+            return
+        is_cut = disagreeing(self.faces, len(self.vertices))
+        if is_cut.any():
+            self._fans(is_cut)
+            edges = _counted(int(is_cut.sum()), "edge", "edges")
+            self.repairs.append(
+                f"cut along {edges} where the surface was one-sided (if you save it, load it with weld=False, or the "
+                "cut closes again)"
+            )
+
+    def _fans(self, is_cut: np.ndarray) -> int:
+        """Give every further fan at a vertex a vertex of its own, where repair is wanted; returns how many were split.
+
+        Args:
+            is_cut: the edges, in the order of `shared_edges`, across which fans do not go on; empty for none.
+        """
         num_faces = len(self.faces)
         one, other, same_way = shared_edges(self.faces, len(self.vertices))
+        if is_cut.size:
+            one, other, same_way = one[~is_cut], other[~is_cut], same_way[~is_cut]
         # Corner j of face f is 3 f + j. A half-edge of block j runs from corner j to corner j + 1 of its face.
         begin, end = 3 * (one % num_faces) + one // num_faces, 3 * (one % num_faces) + (one // num_faces + 1) % 3
         first = 3 * (other % num_faces) + other // num_faces
@@ -311,7 +410,7 @@ class _Workpiece:
         is_further = np.zeros(len(fan_vertices), bool)
         is_further[1:] = fan_vertices[1:] == fan_vertices[:-1]
         if not is_further.any():
-            return
+            return 0
         split = np.unique(fan_vertices[is_further])
         if not self.repair:
             count = int(np.sum(fan_vertices == split[0]))
@@ -326,8 +425,7 @@ class _Workpiece:
         self.faces = renamed.reshape(-1, 3)
         self.vertices = np.concatenate([self.vertices, self.vertices[fan_vertices[is_further]]])
         self.origin = np.concatenate([self.origin, self.origin[fan_vertices[is_further]]])
-        noun = "vertex" if len(split) == 1 else "vertices"
-        self.repairs.append(f"split {len(split)} {noun} where separate fans touched")
+        return len(split)
 
     def check_components(self) -> None:
         """Every connected component has enough vertices."""

@@ -12,6 +12,7 @@ from .arguments import at_least, not_negative
 from .checks import FEWEST_VERTICES
 from .lattices import grid_faces, icosahedral_lattice, torus_points
 from .mesh import Mesh
+from .report import vertex_normals
 
 # A parameter that moves by half its spacing can meet its neighbour.
 _LARGEST_SHIFT = 0.5
@@ -81,7 +82,7 @@ def jittered(
         project: maps positions (N, 3) back onto the surface, e.g. ``lambda x: x / norm(x)``. Without it the vertices
             stay in the tangent planes, which is right for plane shapes.
     """
-    normals = mesh.normals if mesh.normals is not None else _face_weighted_normals(mesh)
+    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     inner = np.flatnonzero(~mesh.boundary_vertices)
     reach = not_negative("amount", amount) * mesh.mesh_size
     moved = mesh.vertices[inner] + _tangential_disc(normals[inner], reach, np.random.default_rng(seed))
@@ -111,11 +112,3 @@ def _hull_sphere(points: np.ndarray) -> Mesh:
     faces_in = np.sum(first * np.cross(second, third), axis=1) < 0
     faces[faces_in] = faces[faces_in][:, [0, 2, 1]]
     return Mesh(directions, faces, normals=directions)
-
-
-def _face_weighted_normals(mesh: Mesh) -> np.ndarray:
-    """Unit vertex normals (V, 3): the sum of the faces' normals, weighted by area."""
-    first, second, third = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normals = np.zeros_like(mesh.vertices)
-    np.add.at(normals, mesh.faces, np.cross(second - first, third - first)[:, None])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -49,7 +49,7 @@ class Mesh:
         faces: Any,
         *,
         repair: bool = False,
-        weld: bool = False,
+        weld: bool | float = False,
         normals: Any | None = None,
         uv: Any | None = None,
     ):
@@ -61,7 +61,9 @@ class Mesh:
             repair: mend what can be mended, instead of raising: drop degenerate, duplicate and broken faces, the extra
                 faces at an edge of three, and components that are too small; split vertices where fans touch. The
                 report lists each action.
-            weld: merge vertices at exactly the same position.
+            weld: True merges vertices that coincide up to rounding: those at the same position, and, where an edge has
+                one face only, its ends with others closer than a ten-thousandth of the shortest edge at either. A
+                distance merges all vertices within it.
             normals: (V, 3) exact unit outward normals, if the surface is known by formula.
             uv: (F, 3, 2) places in an image of the corners of every face, v upwards.
 

@@ -28,7 +28,13 @@ def turned_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     f, g = one % len(faces), other % len(faces)
     given, turned = _double_cover(f, g, same_way, len(faces))
     if np.any(given == turned):
-        raise MeshError(_one_sided(faces, f, g, same_way, given == turned))
+        fails = int(np.flatnonzero(disagreeing(faces, len(vertices)))[0])
+        edge = np.intersect1d(faces[f[fails]], faces[g[fails]])[:2]
+        raise MeshError(
+            f"The surface is not orientable: however the faces are turned, the two at edge {tuple(edge.tolist())} "
+            "disagree, or two elsewhere (as in a Moebius strip or a Klein bottle). Cut it along a curve through that "
+            "edge, or use repair=True to do so."
+        )
     _, component = np.unique(np.minimum(given, turned), return_inverse=True)
     num_faces = np.bincount(component)
     is_turned = given > turned
@@ -61,18 +67,32 @@ def _volumes(corners: np.ndarray, component: np.ndarray, is_turned: np.ndarray) 
     return np.bincount(component, np.where(is_turned, -volumes, volumes))
 
 
-def _one_sided(faces: np.ndarray, f: np.ndarray, g: np.ndarray, same_way: np.ndarray, is_bad: np.ndarray) -> str:
-    """The message, with an edge whose faces disagree once all faces agree along a spanning tree."""
+def disagreeing(faces: np.ndarray, num_vertices: int) -> np.ndarray:
+    """The shared edges at which two faces disagree, whichever way the faces are turned: (P,) bool.
+
+    They are in the order of `shared_edges`, and only on components that are not orientable. There, orientation is
+    propagated breadth-first from one face; the edges where the fronts disagree form curves that are closed or end on
+    the boundary. Cut along them, the surface is orientable.
+
+    Args:
+        faces: (F, 3), at most two at an edge.
+        num_vertices: number of vertices.
+    """
+    one, other, same_way = shared_edges(faces, num_vertices)
     count = len(faces)
-    # Two faces of a closed surface can share two edges; the first is enough for the tree.
-    _, first = np.unique(f * count + g, return_index=True)
-    links = sparse.coo_array((first + 1.0, (f[first], g[first])), shape=(count, count))
-    tree = csgraph.minimum_spanning_tree(links.tocsr()).data.astype(np.int64) - 1
-    given, turned = _double_cover(f[tree], g[tree], same_way[tree], count)
+    f, g = one % count, other % count
+    given, turned = _double_cover(f, g, same_way, count)
+    is_bad = given == turned
+    # Two faces can share two edges; the first is enough for the tree.
+    _, first = np.unique(np.minimum(f, g) * count + np.maximum(f, g), return_index=True)
+    ends = np.concatenate([f[first], g[first]]), np.concatenate([g[first], f[first]])
+    links = sparse.coo_array((np.tile(first + 1, 2), ends), shape=(count, count)).tocsr()
+    tree = []
+    for label in np.unique(given[is_bad]):
+        root = int(np.flatnonzero(given == label)[0])
+        order, parent = csgraph.breadth_first_order(links, root, directed=False)
+        tree.append(np.asarray(links[parent[order[1:]], order[1:]]).ravel() - 1)
+    steps = np.concatenate([np.zeros(0, np.int64), *tree])
+    given, turned = _double_cover(f[steps], g[steps], same_way[steps], count)
     is_turned = given > turned
-    fails = int(np.flatnonzero(is_bad[f] & (same_way ^ is_turned[f] ^ is_turned[g]))[0])
-    edge = np.intersect1d(faces[f[fails]], faces[g[fails]])[:2]
-    return (
-        f"The surface is not orientable: once the other faces agree, those at edge {tuple(edge.tolist())} do not "
-        "(as in a Moebius strip or a Klein bottle). Cut it along a curve through that edge; repair=True cannot."
-    )
+    return is_bad[f] & (same_way ^ is_turned[f] ^ is_turned[g])

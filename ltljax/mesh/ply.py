@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from .errors import MeshError
-from .text_formats import Polygons, coordinates, fan, next_rows, polygon_rows
+from .polygons import triangulated
+from .text_formats import Polygons, coordinates, next_rows, nothing_more, polygon_rows
 
 _CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
+    "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -73,18 +74,26 @@ def _parts(data: bytes) -> tuple[str, list[_Element], bytes]:
 def _parse_head(head: str) -> tuple[str, list[_Element]]:
     kind, elements = "", []
     for words in map(str.split, head.splitlines()):
+        if words[:1] == ["property"]:  # some programs shout
+            words = [*(word.lower() for word in words[:-1]), words[-1]]
         match words:
             case ["format", name, *_]:
                 kind = name
             case ["element", name, count]:
                 elements.append(_Element(name, int(count), []))
             case ["property", "list", size_type, type_, name]:
-                elements[-1].properties.append(_Property(name, _CODES[type_], _CODES[size_type]))
+                elements[-1].properties.append(_Property(name, _code(type_), _code(size_type)))
             case ["property", type_, name]:
-                elements[-1].properties.append(_Property(name, _CODES[type_], None))
+                elements[-1].properties.append(_Property(name, _code(type_), None))
             case _:  # comments
                 pass
     return kind, elements
+
+
+def _code(kind: str) -> str:
+    if kind not in _CODES:
+        raise MeshError(f"the type {kind[:20]!r} is not one of PLY's. Export the file again.")
+    return _CODES[kind]
 
 
 def _corner_list(element: _Element) -> int | None:
@@ -96,7 +105,8 @@ def _corner_list(element: _Element) -> int | None:
 
 def _parse_text(body: str, elements: list[_Element]) -> Polygons:
     rows = [words for line in body.splitlines() if (words := line.split())]
-    vertices, faces, position = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
+    vertices, position = np.zeros((0, 3)), 0
+    rows_of_faces, lead_of_faces, strips = [], 0, []
     for element in elements:
         here = next_rows(rows, position, element.rows, element.name)
         position += element.rows
@@ -108,12 +118,19 @@ def _parse_text(body: str, elements: list[_Element]) -> Polygons:
         if element.name == "vertex":
             vertices = coordinates(here, [names.index(axis) for axis in "xyz"])
         elif element.name == "face" and which is not None:
-            faces = polygon_rows(here, which)
-    return Polygons(vertices, faces)
+            rows_of_faces, lead_of_faces = here, which
+        elif element.name == "tristrips" and which is not None:
+            # Their entries follow the number of entries, like the corners of faces.
+            numbers = [int(word) for row in here for word in (*row[which + 1 : which + 1 + int(row[which])], "-1")]
+            strips.append(_strip_triangles(np.array(numbers, np.int64)))
+    nothing_more(rows, position)
+    triangles = polygon_rows(vertices, rows_of_faces, lead_of_faces)
+    return Polygons(vertices, np.concatenate([triangles, *strips]))
 
 
 def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons:
-    vertices, faces, offset = np.zeros((0, 3)), np.zeros((0, 3), np.int64), 0
+    vertices, offset = np.zeros((0, 3)), 0
+    lists, strips = (np.zeros(0, np.int64), np.zeros(0, np.int64)), []
     for element in elements:
         which = _corner_list(element)
         if which is None:
@@ -126,8 +143,32 @@ def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons
         else:
             corners, sizes, offset = _list_rows(body, element, order, offset, which)
             if element.name == "face":
-                faces = fan(corners, sizes)
-    return Polygons(vertices, faces)
+                lists = corners, sizes
+            elif element.name == "tristrips":
+                # Each list is a strip of its own.
+                strips.append(_strip_triangles(np.insert(corners, np.cumsum(sizes), -1)))
+    if elements and offset < len(body.rstrip(b"\r\n\0 ")):
+        raise MeshError(
+            f"the file holds {len(body) - offset} bytes beyond the rows that its head announces. Correct the numbers "
+            "in the head, or export the file again."
+        )
+    corners, sizes = lists
+    triangles = corners[triangulated(vertices, corners, sizes)]
+    return Polygons(vertices, np.concatenate([triangles, *strips]))
+
+
+def _strip_triangles(strips: np.ndarray) -> np.ndarray:
+    """The triangles (F, 3) of strips, of which every other one is turned over; a negative number ends a strip."""
+    triples = np.stack([strips[:-2], strips[1:-1], strips[2:]], axis=1)
+    ends = np.flatnonzero(strips < 0)
+    begins = np.concatenate([[0], ends + 1])
+    place = np.arange(len(triples))
+    is_turned = (place - begins[np.searchsorted(ends, place)]) % 2 == 1
+    triples[is_turned] = triples[is_turned][:, [1, 0, 2]]
+    is_there = (triples >= 0).all(axis=1)
+    # A corner given twice leads to the next strip.
+    is_there &= (triples[:, 0] != triples[:, 1]) & (triples[:, 1] != triples[:, 2]) & (triples[:, 0] != triples[:, 2])
+    return triples[is_there]
 
 
 def _list_rows(

@@ -9,6 +9,9 @@ Other packages are imported where they are used: who computes on a built-in shap
 import importlib.util
 import io
 import json
+import logging
+import os
+import signal
 import struct
 import subprocess
 import sys
@@ -20,9 +23,20 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from .errors import MeshError
+from . import foreign
+from .errors import MeshError, UnreadableError
 from .ply import parse_ply
-from .text_formats import Polygons, fan, parse_obj, parse_off
+from .polygons import triangulated
+from .text_formats import Polygons, next_rows, parse_obj, parse_off, parse_stl, separate_triangles
+
+# What a reader of another package may take: bytes of memory and seconds of computing, and more for each byte of the
+# file. Waiting for the disk, it may take a few times as long.
+_MEMORY, _MEMORY_PER_BYTE = 3e9, 100
+_SECONDS, _SECONDS_PER_BYTE = 15, 1e-6
+_PATIENCE = 4
+
+# trimesh reports on damaged files to this logger, which without a handler would print.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def read_obj(path: Path) -> Polygons:
@@ -42,17 +56,14 @@ def read_ply(path: Path) -> Polygons:
 
 def read_stl(path: Path) -> Polygons:
     """STL, text or binary; every triangle brings its own three vertices."""
-    from trimesh.exchange.stl import load_stl_ascii, load_stl_binary
-
     data = path.read_bytes()
     announced = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
     # Binary files may begin with "solid" like those in text, so the length decides.
     if len(data) == 84 + 50 * announced:
-        return _polygons(load_stl_binary(io.BytesIO(data)))
+        record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        return separate_triangles(np.frombuffer(data, record, offset=84)["corners"])
     if b"facet" in data[:2000].lower():
-        if b"endsolid" not in data[-2000:].lower():
-            raise MeshError("the file ends without 'endsolid': it is truncated. Export or download it again.")
-        return _polygons(load_stl_ascii(io.BytesIO(data)))
+        return parse_stl(data)
     raise MeshError(
         f"the file announces {announced} triangles, which take {84 + 50 * announced} bytes, but has {len(data)}. "
         "It may be truncated: export or download it again."
@@ -83,73 +94,80 @@ def read_gltf(path: Path) -> Polygons:
     return _scene(load_gltf(checked, resolver=_resolver(path), skip_materials=True))
 
 
-def read_meshio(path: Path) -> Polygons:
-    """VTK, VTU and Gmsh: their triangles, quadrangles and polygons; of curved elements the corners."""
-    _require("meshio", "io")
-    import meshio
-
-    try:
-        grid = meshio.read(path)
-    except (Exception, SystemExit):
-        # Surfaces in legacy VTK files are mostly of the kind POLYDATA, which meshio does not read.
-        if path.suffix.lower() == ".vtk" and b"POLYDATA" in path.read_bytes()[:1000]:
-            return read_vtk(path)
-        raise
-    corners = {"triangle": 3, "quad": 4, "polygon": 0}
-    pieces = []
-    for block in grid.cells:
-        name = block.type.rstrip("0123456789")
-        if name in corners:
-            cells = [list(cell)[: corners[name] or None] for cell in np.asarray(block.data).tolist()]
-            pieces.append(fan([corner for cell in cells for corner in cell], [len(cell) for cell in cells]))
-    if not pieces:
-        found = ", ".join(sorted({block.type for block in grid.cells})) or "nothing"
-        raise MeshError(f"expected triangles, found {found}. Extract the surface first, e.g. with pyvista or Gmsh.")
-    return Polygons(_in_space(np.asarray(grid.points)), np.concatenate(pieces))
+def read_freesurfer_text(path: Path) -> Polygons:
+    """FreeSurfer's surfaces in text (``.asc``)."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    words = [row for line in lines if (row := line.partition("#")[0].split())]
+    num_vertices, num_faces = int(words[0][0]), int(words[0][1])
+    points = np.array([row[:3] for row in next_rows(words, 1, num_vertices, "vertices")], np.float64)
+    faces = next_rows(words, 1 + num_vertices, num_faces, "faces")
+    return Polygons(points.reshape(-1, 3), np.array([row[:3] for row in faces], np.int64).reshape(-1, 3))
 
 
-# Run by a child process: reads a file and saves the arrays, or says what the file holds instead.
-_READ_VTK = """
-import sys, numpy, pyvista
-surface = pyvista.read(sys.argv[1])
-if not isinstance(surface, pyvista.PolyData):
-    sys.exit(type(surface).__name__)
-triangles = surface.triangulate()
-numpy.savez(sys.argv[2], points=triangles.points, faces=numpy.reshape(triangles.faces, (-1, 4))[:, 1:])
-"""
+def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
+    """The arrays that a reader of another package finds in a file, by name; see `foreign`.
 
+    It runs in a process of its own, with bounds on its memory and time.
 
-def read_vtk(path: Path) -> Polygons:
-    """VTK surfaces (POLYDATA), text, binary or XML.
-
-    In a process of its own: on damaged files VTK ends the process that reads them, and a notebook with it.
+    Raises:
+        MeshError: the package is not installed, the file is not taken, or reading it takes too long.
+        UnreadableError: the file is damaged, or reading it takes too much memory.
     """
-    _require("pyvista", "viz")
+    package = foreign.PACKAGES[reader]
+    if importlib.util.find_spec(package) is None:
+        extra = "viz" if package == "pyvista" else "io"
+        raise MeshError(f'reading this kind of file needs {package}. Run: pip install "ltljax[{extra}]"')
+    size = path.stat().st_size
+    memory, seconds = _MEMORY + _MEMORY_PER_BYTE * size, _SECONDS + _SECONDS_PER_BYTE * size
+    # One thread: the libraries below NumPy reserve memory for each.
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "surface.npz"
-        command = [sys.executable, "-c", _READ_VTK, str(path.absolute()), str(target)]
-        done = subprocess.run(command, capture_output=True, timeout=600, check=False)
-        if not target.exists():
-            lines = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
-            reason = lines[-1][:200] if lines else f"the reader ended with code {done.returncode}"
-            raise MeshError(
-                f"expected a VTK surface (PolyData), found: {reason}. Extract the surface or export it again."
+        target = Path(folder) / "arrays.npz"
+        arguments = [reader, path.absolute(), target, memory, seconds, json.dumps([*map(str, sys.path)])]
+        command = [sys.executable, "-I", foreign.__file__, *map(str, arguments)]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, timeout=_PATIENCE * seconds, check=False, env=environment
             )
+        except subprocess.TimeoutExpired:
+            raise MeshError(f"{package} did not end within {_PATIENCE * seconds:.0f} s. Convert it to PLY.") from None
+        report = target.with_suffix(".json")
+        text = report.read_text(encoding="utf-8") if report.exists() else ""
+        if not text:
+            raise UnreadableError(_last_words(done, package, seconds))
+        said = json.loads(text)
+        if "refused" in said:
+            raise MeshError(said["refused"])
+        if "failed" in said:
+            raise UnreadableError(said["failed"])
         with np.load(target) as arrays:
-            return Polygons(arrays["points"], arrays["faces"])
+            return {name: arrays[f"array_{index}"] for index, name in enumerate(said["names"])}
 
 
-def read_gifti(path: Path) -> Polygons:
-    """GIfTI surfaces, as brain atlases use them."""
-    _require("nibabel", "io")
-    import nibabel
+def _by(reader: str) -> Callable[[Path], Polygons]:
+    """What reads a mesh by another package."""
 
-    image: Any = nibabel.load(path)
-    points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
-    triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
-    if not points or not triangles:
-        raise MeshError("expected a surface, found no points or no triangles. Choose the file that holds the geometry.")
-    return Polygons(np.asarray(points[0].data), np.asarray(triangles[0].data))
+    def read(path: Path) -> Polygons:
+        arrays = read_elsewhere(reader, path)
+        vertices, corners = arrays["vertices"], arrays["corners"]
+        return Polygons(vertices, corners[triangulated(vertices, corners, arrays["sizes"])])
+
+    return read
+
+
+def _last_words(done: subprocess.CompletedProcess[bytes], package: str, seconds: float) -> str:
+    """Why a process left no report."""
+    if hasattr(signal, "SIGXCPU") and done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return f"{package} was stopped after {seconds:.0f} s of computing, or for want of memory"
+    lines = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
+    return f"{package} ended with code {done.returncode}" + (f": {lines[-1]}" if lines else "")
+
+
+def read_legacy_vtk(path: Path) -> Polygons:
+    """VTK's older format. Most surfaces in it are POLYDATA, which meshio does not read."""
+    with open(path, "rb") as file:
+        is_surface = b"POLYDATA" in file.read(1000)
+    return _by("vtk" if is_surface else "meshio")(path)
 
 
 READERS: dict[str, Callable[[Path], Polygons]] = {
@@ -159,11 +177,13 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     "off": read_off,
     "glb": read_glb,
     "gltf": read_gltf,
-    "vtk": read_meshio,
-    "vtu": read_meshio,
-    "msh": read_meshio,
-    "vtp": read_vtk,
-    "gii": read_gifti,
+    "vtk": read_legacy_vtk,
+    "vtu": _by("meshio"),
+    "msh": _by("meshio"),
+    "vtp": _by("vtk"),
+    "gii": _by("gifti"),
+    "asc": read_freesurfer_text,
+    **dict.fromkeys(("pial", "white", "inflated", "orig", "smoothwm", "sphere"), _by("freesurfer")),
 }
 
 
@@ -173,19 +193,6 @@ def _resolver(path: Path) -> Any:
     return FilePathResolver(str(path))
 
 
-def _require(module: str, extra: str) -> None:
-    """Raises an error that names the extra to install, where the optional module is missing."""
-    if importlib.util.find_spec(module) is None:
-        raise MeshError(f'reading this kind of file needs {module}. Run: pip install "ltljax[{extra}]"')
-
-
-def _in_space(points: np.ndarray) -> np.ndarray:
-    """Points (V, 3), with zeros added to plane ones (V, 2)."""
-    if points.ndim == 2 and points.shape[1] == 2:
-        return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    return points
-
-
 def _polygons(loaded: dict[str, Any]) -> Polygons:
     """The geometry in what a trimesh reader returns: one mesh, or several by name."""
     if "geometry" in loaded:
@@ -193,10 +200,7 @@ def _polygons(loaded: dict[str, Any]) -> Polygons:
     faces = loaded.get("faces")
     if faces is None:
         faces = np.zeros((0, 3), np.int64)
-    faces = np.asarray(faces)
-    if faces.ndim == 2 and faces.shape[1] != 3:
-        faces = fan(faces.ravel().tolist(), [faces.shape[1]] * len(faces))
-    return Polygons(np.asarray(loaded["vertices"]), faces)
+    return Polygons(np.asarray(loaded["vertices"]), np.asarray(faces))
 
 
 def _joined(parts: list[Polygons]) -> Polygons:
@@ -219,7 +223,12 @@ def _check_gltf(header: dict[str, Any], path: Path) -> None:
             raise MeshError(f"accessor {index} is compressed or sparse. Export the file without compression.")
     for buffer in header.get("buffers", []):
         uri = buffer.get("uri", "data:")
-        if not uri.startswith("data:") and not (path.parent / unquote(uri)).is_file():
+        if uri.startswith("data:"):
+            continue
+        place = (path.parent / unquote(uri)).resolve()
+        if not place.is_relative_to(path.parent.resolve()):
+            raise MeshError(f"the buffer {uri[:80]!r} lies outside the file's own folder. Export to GLB.")
+        if not place.is_file():
             raise MeshError(f"the buffer {uri[:80]!r} is missing. Put it beside the file, or export to GLB.")
 
 

@@ -37,7 +37,7 @@ class MeshReport:
         mean_valence: mean number of edges at a vertex.
         vertices_in_file: number of vertices in the file or the array handed in.
         faces_in_file: number of triangles in the file (after splitting larger faces) or the array handed in.
-        welded_vertices: vertices merged into another one at the same position.
+        welded_vertices: vertices merged into another one at the same position, up to rounding.
         dropped_vertices: vertices that no face refers to.
         reoriented_faces: faces turned over so that all agree, and point outwards on closed components.
         repairs: one sentence for each thing that was mended.
@@ -127,6 +127,14 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The area of each face, (F,)."""
     first, second, third = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals of the vertices, (V, 3): those of the faces around each, weighted by area; zero without any."""
+    first, second, third = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, np.cross(second - first, third - first)[:, None])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def face_edge_lengths(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The formats that are lines of text: OBJ and OFF, and what the text form of PLY shares with them.
+"""The formats that are lines of text: OBJ, OFF and STL, and what the text form of PLY shares with them.
 
 What enters: the bytes of a file. What leaves: `Polygons`, unchecked.
 
@@ -7,12 +7,13 @@ without a face and regroups by material, so that the order of the file, which pe
 takes an OFF that ends too early for a complete one.
 """
 
-from collections.abc import Sequence
+import re
 from typing import NamedTuple
 
 import numpy as np
 
 from .errors import MeshError
+from .polygons import triangulated
 
 
 class Polygons(NamedTuple):
@@ -21,22 +22,6 @@ class Polygons(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None = None
-
-
-def fan(corners: Sequence[int] | np.ndarray, sizes: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Triangles (F, 3) that fan out from the first corner of each polygon.
-
-    Args:
-        corners: the corners of all polygons, one after the other.
-        sizes: the number of corners of each polygon.
-    """
-    flat, counts = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
-    if np.any(counts < 3):
-        first = int(np.flatnonzero(counts < 3)[0])
-        raise MeshError(f"face {first} has {counts[first]} corners; it needs at least three. Correct or remove it.")
-    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    step = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([flat[start], flat[start + step + 1], flat[start + step + 2]], axis=1)
 
 
 def parse_obj(data: bytes) -> Polygons:
@@ -72,26 +57,108 @@ def parse_obj(data: bytes) -> Polygons:
         except ValueError:
             raise MeshError(f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it.") from None
     vertices, uv = np.array(coordinates, dtype=np.float64).reshape(-1, 3), None
+    triangles = triangulated(vertices, corners, sizes)
     if placed and min(placed) >= 0 and max(placed) < len(places) // 2:
-        uv = np.array(places, dtype=np.float64).reshape(-1, 2)[fan(placed, sizes)]
-    return Polygons(vertices, fan(corners, sizes), uv)
+        uv = np.array(places, dtype=np.float64).reshape(-1, 2)[np.array(placed)[triangles]]
+    return Polygons(vertices, np.array(corners, np.int64)[triangles], uv)
 
 
 def parse_off(data: bytes) -> Polygons:
-    """OFF: a head, the counts, a line for each vertex and each face; comments begin with #."""
-    text = data.decode("utf-8", errors="replace")
+    """OFF: a head, the counts, a line for each vertex and each face; comments begin with #.
+
+    Also as programs write it: the head in small letters, with the counts behind it or absent, and numbers that go on
+    from line to line.
+    """
+    text = data.decode("utf-8-sig", errors="replace")
     rows = [words for line in text.splitlines() if (words := line.partition("#")[0].split())]
-    head = rows[0].pop(0) if rows else ""
     # A head such as CNOFF announces colours and normals, which follow the three coordinates.
-    if head not in ("OFF", "COFF", "NOFF", "CNOFF", "STOFF"):
-        raise MeshError(f"expected the head OFF, found {head[:20]!r}. Check that the file is in the OFF format.")
+    found = re.match(r"(?:ST)?C?N?OFF", rows[0][0].upper()) if rows else None
+    if found is not None:
+        rest = rows[0][0][found.end() :]
+        rows[0] = [rest, *rows[0][1:]] if rest else rows[0][1:]
+    head = rows[0][0] if rows and rows[0] else ""
     rows = [row for row in rows if row]
-    if not rows or len(rows[0]) < 2:
+    if found is None and not head.isdecimal():
+        raise MeshError(f"expected the head OFF, found {head[:20]!r}. Check that the file is in the OFF format.")
+    numbers = [word for row in rows[:2] for word in row][:2]
+    if len(numbers) < 2 or not all(word.lstrip("-").isdecimal() for word in numbers):
         raise MeshError("expected the numbers of vertices and faces after the head. Export or download the file again.")
-    num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
+    num_vertices, num_faces = map(int, numbers)
+    if num_vertices > 0 and not _is_in_lines(rows, num_vertices, num_faces):
+        head_letters = "" if found is None else found.group()
+        words = [word for row in rows for word in row][3:]
+        flowing = _off_rows(words, num_vertices, num_faces, head_letters)
+        rows = rows if flowing is None else [rows[0], *flowing]
     vertex_rows = next_rows(rows, 1, num_vertices, "vertices")
     face_rows = next_rows(rows, 1 + num_vertices, num_faces, "faces")
-    return Polygons(coordinates(vertex_rows, [0, 1, 2]), polygon_rows(face_rows, 0))
+    nothing_more(rows, 1 + num_vertices + num_faces)
+    vertices = coordinates(vertex_rows, [0, 1, 2])
+    return Polygons(vertices, polygon_rows(vertices, face_rows, 0))
+
+
+def parse_stl(data: bytes) -> Polygons:
+    """STL as text: three ``vertex`` lines for each triangle."""
+    text = data.decode("utf-8", errors="replace").lower()
+    if "endsolid" not in text[-2000:]:
+        raise MeshError("the file ends without 'endsolid': it is truncated. Export or download it again.")
+    corners = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if words and words[0] == "vertex":
+            try:
+                x, y, z = words[1:]
+                corners.append((float(x), float(y), float(z)))
+            except ValueError:
+                raise MeshError(
+                    f"line {number} is not readable: {line.strip()[:60]!r}. Correct or remove it."
+                ) from None
+    if len(corners) % 3:
+        raise MeshError(f"the file holds {len(corners)} corners, no multiple of three. Export or download it again.")
+    return separate_triangles(np.array(corners).reshape(-1, 3, 3))
+
+
+def separate_triangles(corners: np.ndarray) -> Polygons:
+    """Triangles (F, 3, 3) that share no vertices."""
+    return Polygons(corners.reshape(-1, 3).astype(np.float64), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def _is_in_lines(rows: list[list[str]], num_vertices: int, num_faces: int) -> bool:
+    """Whether each vertex and each face of an OFF file has a line of its own."""
+    faces = rows[1 + num_vertices : 1 + num_vertices + num_faces]
+    return (
+        len(rows) >= 1 + num_vertices + num_faces
+        and len(rows[0]) >= 2
+        and all(len(row) >= 3 for row in rows[1 : 1 + num_vertices])
+        and all(row[0].isdecimal() and len(row) >= 1 + int(row[0]) for row in faces)
+    )
+
+
+def _off_rows(words: list[str], num_vertices: int, num_faces: int, head: str) -> list[list[str]] | None:
+    """The rows of vertices and faces of an OFF file whose lines end anywhere; None where the numbers do not fit.
+
+    Behind the coordinates of a vertex the head announces a normal (N), a colour of three or four numbers (C) and a
+    place in an image (ST).
+    """
+    others = 3 * ("N" in head) + 2 * ("ST" in head)
+    for count in (3 + others + color for color in ((4, 3) if "C" in head else (0,))):
+        rows = [words[count * index : count * (index + 1)] for index in range(num_vertices)]
+        place = count * num_vertices
+        while place < len(words) and len(rows) < num_vertices + num_faces and words[place].isdecimal():
+            stop = place + 1 + int(words[place])
+            rows.append(words[place:stop])
+            place = stop
+        if len(rows) == num_vertices + num_faces and place == len(words):
+            return rows
+    return None
+
+
+def nothing_more(rows: list[list[str]], expected: int) -> None:
+    """Raises where a file holds more rows than its head announces."""
+    if len(rows) > expected:
+        raise MeshError(
+            f"the file has more rows than its head announces, by {len(rows) - expected}. Correct the numbers in "
+            "the head, or export the file again."
+        )
 
 
 def next_rows(rows: list[list[str]], start: int, count: int, what: str) -> list[list[str]]:
@@ -114,7 +181,7 @@ def coordinates(rows: list[list[str]], columns: list[int]) -> np.ndarray:
     return np.array([(float(row[x]), float(row[y]), float(row[z])) for row in rows]).reshape(-1, 3)
 
 
-def polygon_rows(rows: list[list[str]], lead: int) -> np.ndarray:
+def polygon_rows(vertices: np.ndarray, rows: list[list[str]], lead: int) -> np.ndarray:
     """The triangles of rows that hold, after ``lead`` other words, the number of corners and the corners."""
     corners: list[int] = []
     sizes: list[int] = []
@@ -125,4 +192,4 @@ def polygon_rows(rows: list[list[str]], lead: int) -> np.ndarray:
             raise MeshError(f"face {index} announces {size} corners, but has {len(found)}. Download the file again.")
         corners += map(int, found)
         sizes.append(size)
-    return fan(corners, sizes)
+    return np.array(corners, np.int64)[triangulated(vertices, corners, sizes)]
