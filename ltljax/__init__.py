@@ -48,7 +48,7 @@ from .fit import (
     total_variation,
 )
 from .lifting.schemes import Monotone, Paper, Polynomial
-from .mesh import Mesh, MeshError, load_mesh, shapes
+from .mesh import Mesh, MeshError, as_mesh, load_mesh, shapes, vertex_data
 from .operators import (
     divergence,
     gradient,
@@ -61,6 +61,8 @@ from .operators import (
     spectral_width,
     weighted_laplacian,
 )
+from .output.load import load_fields
+from .output.save import save
 from .show import displaced, plot, plot_dispersion, view
 from .solve import (
     RKL1,
@@ -173,6 +175,7 @@ __all__ = [
     "Steady",
     "Surface",
     "VectorDiffusion",
+    "as_mesh",
     "check_gradient",
     "choose_weight",
     "connection",
@@ -207,6 +210,7 @@ __all__ = [
     "laplacian_matrix",
     "lie_bracket",
     "lie_derivative",
+    "load_fields",
     "load_mesh",
     "multigrid",
     "pattern_statistics",
@@ -216,6 +220,7 @@ __all__ = [
     "polyhedral_curvature",
     "rotated",
     "rotated_gradient",
+    "save",
     "screened_poisson",
     "shapes",
     "singularities",
@@ -231,6 +236,7 @@ __all__ = [
     "transport_along",
     "transport_vectors",
     "vector_laplacian",
+    "vertex_data",
     "view",
     "weighted_laplacian",
 ]

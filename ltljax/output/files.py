@@ -1,9 +1,11 @@
-"""Surfaces and their fields as files: VTK PolyData and time series for ParaView, PLY and GLB with colours, OBJ."""
+"""Surfaces and their fields as files: VTK and time series for ParaView, PLY and GLB with colours, OBJ, STL, 3MF."""
 
 import base64
 import json
 import struct
+import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -12,23 +14,117 @@ import numpy as np
 from ..mesh import far_middle
 
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
+def write_ply(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> None:
     """Write a binary PLY with per-vertex colours (V, 3) or (V, 4) of unsigned bytes.
 
     Positions are floats, which all programs read, or doubles where floats would blur the shape.
+
+    Args:
+        path: where to.
+        vertices: (V, 3).
+        faces: (F, 3).
+        colors: per vertex.
+        fields: further columns by name, (V,), or (V, C), whose columns are called ``name_0`` and so on.
     """
     size, name = ("f8", "double") if np.any(far_middle(vertices)) else ("f4", "float")
     channels = ("red", "green", "blue", "alpha")[: colors.shape[1]]
-    points = np.zeros(len(vertices), [("position", f"<{size}", 3), ("color", "u1", len(channels))])
+    columns = scalar_columns(fields or {})
+    if taken := {"x", "y", "z", *channels} & columns.keys():
+        raise ValueError(f"A PLY file has a column {min(taken)!r} of its own. Give the field another name.")
+    kinds = {name: _ply_type(values.dtype) for name, values in columns.items()}
+    points = np.zeros(
+        len(vertices),
+        [
+            ("position", f"<{size}", 3),
+            ("color", "u1", len(channels)),
+            *((f"field {name}", f"<{kind}") for name, kind in kinds.items()),
+        ],
+    )
     points["position"], points["color"] = vertices, colors
+    for column, values in columns.items():
+        points[f"field {column}"] = values
     triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
     triangles["count"], triangles["corners"] = 3, faces
     header = [
         "ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
         *(f"property {name} {axis}" for axis in "xyz"), *(f"property uchar {channel}" for channel in channels),
+        *(f"property {_PLY_TYPES[kind]} {column}" for column, kind in kinds.items()),
         f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header\n",
     ]  # fmt: skip
     path.write_bytes("\n".join(header).encode("ascii") + points.tobytes() + triangles.tobytes())
+
+
+_PLY_TYPES = {
+    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
+    "f8": "double",
+}  # fmt: skip
+
+
+def _ply_type(dtype: np.dtype) -> str:
+    """The type of a column, as NumPy calls it; 64-bit integers, which PLY has not, become doubles."""
+    kind = "u1" if dtype.kind == "b" else dtype.str[1:]
+    return kind if kind in _PLY_TYPES else "f8"
+
+
+def scalar_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Fields (V,) and (V, C) as columns (V,), those of the latter with numbers behind their names.
+
+    Raises:
+        ValueError: two columns have the same name, or one has a space or letters beyond ASCII, which such files cannot
+            hold.
+    """
+    columns: dict[str, np.ndarray] = {}
+    for name, values in fields.items():
+        if not name.isascii() or " " in name or "end_header" in name:
+            raise ValueError(f"Expected names of fields in ASCII and without spaces, found {name!r}.")
+        parts = {name: values} if values.ndim == 1 else {f"{name}_{i}": part for i, part in enumerate(values.T)}
+        if twice := parts.keys() & columns.keys():
+            raise ValueError(f"Two columns would be called {min(twice)!r}. Give the fields other names.")
+        columns |= parts
+    return columns
+
+
+def write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a binary STL, whose numbers are in float32; of a shape far from the origin those about its middle."""
+    vertices = vertices - far_middle(vertices)
+    triangles = np.zeros(len(faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    triangles["normal"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    triangles["corners"] = corners
+    path.write_bytes(b"ltljax".ljust(80) + struct.pack("<I", len(faces)) + triangles.tobytes())
+
+
+def write_3mf(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a 3MF file, as printers take it, whose unit is the millimetre.
+
+    Source: 3D Manufacturing Format, core specification 1.3, chapters 2 (the package) and 4 (meshes).
+    """
+    points = "".join(f'<vertex x="{x:.17g}" y="{y:.17g}" z="{z:.17g}"/>' for x, y, z in vertices.tolist())
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces.tolist())
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    schema = "http://schemas.openxmlformats.org/package/2006"
+    maker = "http://schemas.microsoft.com/3dmanufacturing"
+    parts = {
+        "[Content_Types].xml": f'<Types xmlns="{schema}/content-types">'
+        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+        '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>',
+        "_rels/.rels": f'<Relationships xmlns="{schema}/relationships">'
+        f'<Relationship Target="/3D/3dmodel.model" Id="r0" Type="{maker}/2013/01/3dmodel"/></Relationships>',
+        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{maker}/core/2015/02">'
+        '<resources><object id="1" type="model"><mesh>'
+        f"<vertices>{points}</vertices><triangles>{triangles}</triangles></mesh></object></resources>"
+        '<build><item objectid="1"/></build></model>',
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in parts.items():
+            archive.writestr(name, head + text)
 
 
 def write_obj(
@@ -120,8 +216,14 @@ def write_glb(
     path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
 
 
-def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[str, np.ndarray]) -> None:
-    """Write a VTK PolyData file (``.vtp``) with fields on the vertices, (V,) or (V, C).
+def write_vtp(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    fields: Mapping[str, np.ndarray],
+    unstructured: bool = False,
+) -> None:
+    """Write a VTK PolyData file (``.vtp``), or an unstructured grid (``.vtu``), with fields (V,) or (V, C).
 
     XML with compressed arrays inside, which ParaView and every VTK reader open. Written here so that results can be
     kept where no VTK is installed.
@@ -130,16 +232,24 @@ def write_vtp(path: Path, vertices: np.ndarray, faces: np.ndarray, fields: dict[
     """
     offsets = 3 * np.arange(1, len(faces) + 1)
     point_data = "".join(_array(name, np.asarray(values)) for name, values in fields.items())
+    cells = f"{_array('connectivity', faces.ravel().astype(np.int64))}{_array('offsets', offsets)}"
+    if unstructured:
+        kind, counts = "UnstructuredGrid", f'NumberOfCells="{len(faces)}"'
+        triangle = 5  # VTK's number for it
+        cells = f"<Cells>\n{cells}{_array('types', np.full(len(faces), triangle, np.uint8))}</Cells>\n"
+    else:
+        kind = "PolyData"
+        counts = f'NumberOfPolys="{len(faces)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0"'
+        cells = f"<Polys>\n{cells}</Polys>\n"
     path.write_text(
         '<?xml version="1.0" encoding="UTF-8"?>\n'
-        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
+        f'<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
         'compressor="vtkZLibDataCompressor">\n'
-        f'<PolyData><Piece NumberOfPoints="{len(vertices)}" NumberOfPolys="{len(faces)}" NumberOfVerts="0" '
-        'NumberOfLines="0" NumberOfStrips="0">\n'
+        f'<{kind}><Piece NumberOfPoints="{len(vertices)}" {counts}>\n'
         f"<PointData>\n{point_data}</PointData>\n"
         f"<Points>\n{_array('Points', vertices)}</Points>\n"
-        f"<Polys>\n{_array('connectivity', faces.ravel().astype(np.int64))}{_array('offsets', offsets)}</Polys>\n"
-        "</Piece></PolyData>\n</VTKFile>\n",
+        f"{cells}"
+        f"</Piece></{kind}>\n</VTKFile>\n",
         encoding="utf-8",
     )
 
@@ -156,10 +266,14 @@ def write_series(path: Path, times: np.ndarray, files: list[str]) -> None:
     )
 
 
-_VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64"}
+_VTK_TYPES = {
+    "f4": "Float32", "f8": "Float64", "i1": "Int8", "u1": "UInt8", "i2": "Int16", "u2": "UInt16", "i4": "Int32",
+    "u4": "UInt32", "i8": "Int64", "u8": "UInt64",
+}  # fmt: skip
 
 
 def _array(name: str, values: np.ndarray) -> str:
+    values = values.astype(np.uint8) if values.dtype.kind == "b" else values
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     kind = _VTK_TYPES[values.dtype.str[1:]]
     components = values.shape[1] if values.ndim == 2 else 1

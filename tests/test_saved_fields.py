@@ -1,0 +1,279 @@
+"""What `save` writes, `load_fields` and `load_mesh` read back, and other programs open."""
+
+import zipfile
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+import ltljax as ltl
+from ltljax.mesh.columns import DataError
+
+MESH = ltl.shapes.icosphere(2)
+FIELDS = {"height": MESH.vertices[:, 2], "normal": MESH.vertices.astype(np.float32)}
+
+
+def components(fields):
+    return {"height": fields["height"]} | {f"normal_{i}": fields["normal"][:, i] for i in range(3)}
+
+
+@pytest.mark.parametrize(
+    ("name", "is_split", "tolerance"),
+    [
+        ("ball.vtp", False, 0),
+        ("ball.vtu", False, 0),
+        ("ball.npz", False, 0),
+        ("ball.zarr", False, 0),
+        ("ball.ply", True, 0),
+        ("ball.gii", True, 1e-6),
+        ("ball.func.gii", True, 1e-6),
+    ],
+)
+def test_fields_come_back_by_name(tmp_path, name, is_split, tolerance):
+    if name.endswith(".zarr"):
+        pytest.importorskip("zarr")
+    ltl.save(tmp_path / name, MESH, FIELDS)
+    loaded, expected = ltl.load_fields(tmp_path / name), components(FIELDS) if is_split else FIELDS
+    assert set(loaded) == set(expected)
+    for key, values in expected.items():
+        np.testing.assert_allclose(loaded[key], values, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["a.vtp", "a.vtu", "a.ply", "a.glb", "a.obj", "a.stl", "a.gii"])
+def test_the_mesh_comes_back(tmp_path, name):
+    ltl.save(tmp_path / name, MESH, FIELDS)
+    loaded = ltl.load_mesh(tmp_path / name)
+    assert (loaded.num_vertices, loaded.num_faces) == (MESH.num_vertices, MESH.num_faces)
+    assert loaded.area == pytest.approx(MESH.area, rel=1e-6)
+    if name != "a.stl":
+        np.testing.assert_allclose(loaded.vertices, MESH.vertices, atol=1e-6)
+
+
+def test_a_field_may_have_any_name(tmp_path):
+    ltl.save(tmp_path / "a.npz", MESH, {"file": MESH.vertices[:, 0], "allow_pickle": MESH.vertices[:, 1]})
+    np.testing.assert_array_equal(ltl.load_fields(tmp_path / "a.npz")["file"], MESH.vertices[:, 0])
+
+
+@pytest.mark.parametrize("name", ["a.pvd", "a.npz", "a.zarr", "a.gii"])
+def test_a_series_comes_back_with_its_times(tmp_path, name):
+    if name.endswith(".zarr"):
+        pytest.importorskip("zarr")
+    times = np.array([0.0, 0.5, 2.0])
+    series = {"u": np.stack([t + MESH.vertices[:, 0] for t in times])}
+    ltl.save(tmp_path / name, MESH, series, times=times)
+    loaded = ltl.load_fields(tmp_path / name)
+    np.testing.assert_allclose(loaded["u"], series["u"], atol=1e-6)
+    if name != "a.gii":  # which knows no times
+        np.testing.assert_array_equal(loaded["times"], times)
+
+
+def test_a_file_that_knows_no_times_gets_the_last_field(tmp_path):
+    series = {"u": np.stack([np.zeros(MESH.num_vertices), MESH.vertices[:, 0]])}
+    ltl.save(tmp_path / "a.curv", MESH, series, times=[0, 1])
+    np.testing.assert_allclose(ltl.load_fields(tmp_path / "a.curv")["curv"], MESH.vertices[:, 0], atol=1e-6)
+    with pytest.raises(ValueError, match="give one field"):
+        ltl.save(tmp_path / "a.curv", MESH, FIELDS)
+
+
+def test_a_relief_is_printed_by_the_values_of_a_field(tmp_path):
+    for name in ("a.stl", "a.3mf", "a.ply"):
+        ltl.save(tmp_path / name, MESH, {"height": MESH.vertices[:, 2]}, displacement=0.5)
+    radii = np.linalg.norm(ltl.load_mesh(tmp_path / "a.ply").vertices, axis=1)
+    np.testing.assert_allclose(radii, 1 + 0.25 * (1 + MESH.vertices[:, 2]), atol=1e-3)
+    assert ltl.load_mesh(tmp_path / "a.stl").is_closed
+    with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
+        assert archive.read("3D/3dmodel.model").count(b"<triangle ") == MESH.num_faces
+    with pytest.raises(ValueError, match="displacement needs a field of one number"):
+        ltl.save(tmp_path / "a.stl", MESH, displacement=0.5)
+
+
+def test_trimesh_opens_the_3mf(tmp_path):
+    pytest.importorskip("lxml")
+    pytest.importorskip("networkx")
+    ltl.save(tmp_path / "a.3mf", MESH)
+    assert trimesh.load(tmp_path / "a.3mf", force="mesh").volume == pytest.approx(
+        trimesh.Trimesh(MESH.vertices, MESH.faces).volume, rel=1e-6
+    )
+
+
+def test_a_surface_is_saved_where_it_is(tmp_path):
+    surface = ltl.Surface.from_mesh(MESH)
+    moved = surface.with_vertices(2 * surface.vertices)
+    ltl.save(tmp_path / "a.ply", moved, {"u": np.arange(MESH.num_vertices)})
+    np.testing.assert_allclose(ltl.load_mesh(tmp_path / "a.ply").vertices, 2 * MESH.vertices, atol=1e-6)
+
+
+def test_an_obj_with_a_map_gets_a_texture(tmp_path):
+    square = ltl.shapes.square(1.0, 8)
+    flat = square.vertices[:, :2] - square.vertices[:, :2].min(axis=0)
+    mesh = ltl.Mesh(square.vertices, square.faces, uv=flat[square.faces])
+    ltl.save(tmp_path / "a.obj", mesh, {"u": flat[:, 0]})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mtl", "a.obj", "a.png"]
+    ltl.save(tmp_path / "a.obj", mesh, {"u": flat[:, 1]})
+    (tmp_path / "a.mtl").write_text("mine")
+    picture = (tmp_path / "a.png").read_bytes()
+    with pytest.raises(ValueError, match="is in the way"):
+        ltl.save(tmp_path / "a.obj", mesh, {"u": flat[:, 0]})
+    assert ((tmp_path / "a.mtl").read_text(), (tmp_path / "a.png").read_bytes()) == ("mine", picture)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "message"),
+    [
+        ("a.xyz", {}, r"ends in \.vtp"),
+        ("a.vtp", {"u": np.zeros(5)}, r"'u' as numbers of shape \(162,\)"),
+        ("a.vtp", {"u": np.array(["x"] * 162)}, "found the type <U1"),
+        ("a.npz", {"vertices": np.zeros(162)}, "reserved for the mesh or its times"),
+        ("a.vtp", {"": np.zeros(162)}, "printable text without slashes"),
+        ("a.vtp", {"a\x01": np.zeros(162)}, "printable text without slashes"),
+        ("a.zarr", {"u/v": np.zeros(162)}, "printable text without slashes"),
+        ("a.ply", {"end_header": np.zeros(162)}, "without spaces"),
+        ("a.ply", {"höhe": np.zeros(162)}, "in ASCII"),
+        ("a.ply", {"a_0": np.zeros(162), "a": np.zeros((162, 2))}, "Two columns would be called 'a_0'"),
+        ("a.gii", {"labels": np.arange(162) + 2**24}, "does not hold the whole numbers"),
+        ("a.vtp", {"u": np.ma.masked_array(np.zeros(162), np.ones(162, bool))}, "whose mask would be lost"),
+        ("a.ply", {"x": np.zeros(162)}, "column 'x' of its own"),
+        ("a.ply", {"two words": np.zeros(162)}, "without spaces"),
+    ],
+)
+def test_what_cannot_be_saved_is_refused(tmp_path, name, fields, message):
+    with pytest.raises(ValueError, match=message):
+        ltl.save(tmp_path / name, MESH, fields)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.csv", "u,v\n1\n"), ("a.npz", "x"), ("a.vtp", "x"), ("a.pvd", "<VTKFile>"), ("a.gii", "x"), ("a.xyz", "x")],
+)
+def test_a_damaged_file_of_fields_is_one_sentence(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DataError, match=r"a\.\w+: expected") as caught:
+        ltl.load_fields(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(DataError, match="there is none at"):
+        ltl.load_fields(tmp_path / f"missing{(tmp_path / name).suffix if name != 'a.xyz' else '.csv'}")
+
+
+def test_meshes_of_other_packages_come_with_their_data():
+    pyvista, meshio = pytest.importorskip("pyvista"), pytest.importorskip("meshio")
+    height = MESH.vertices[:, 2]
+    ball = trimesh.Trimesh(MESH.vertices, MESH.faces, process=False)
+    ball.vertex_attributes["height"] = height
+    poly = pyvista.PolyData.from_regular_faces(MESH.vertices, MESH.faces)
+    poly["height"] = height
+    grid = meshio.Mesh(MESH.vertices, [("triangle", MESH.faces)], point_data={"height": height})
+    for source in (ball, poly, grid):
+        mesh = ltl.as_mesh(source)
+        np.testing.assert_allclose(mesh.vertices, MESH.vertices, atol=1e-7)
+        np.testing.assert_array_equal(mesh.faces, MESH.faces)
+        np.testing.assert_array_equal(ltl.vertex_data(source, mesh)["height"], height)
+    tensor = lambda array: SimpleNamespace(numpy=lambda: array)  # noqa: E731
+    for source in (
+        (MESH.vertices, MESH.faces),
+        {"vertices": MESH.vertices, "faces": MESH.faces},
+        SimpleNamespace(vertices=MESH.vertices, triangles=MESH.faces),
+        SimpleNamespace(vertex={"positions": tensor(MESH.vertices)}, triangle={"indices": tensor(MESH.faces)}),
+    ):
+        mesh = ltl.as_mesh(source)
+        np.testing.assert_array_equal(mesh.faces, MESH.faces)
+        assert ltl.vertex_data(source, mesh) == {}
+    assert ltl.as_mesh(MESH) is MESH
+
+
+def test_polygons_of_other_packages_become_triangles():
+    pyvista, meshio = pytest.importorskip("pyvista"), pytest.importorskip("meshio")
+    points = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2.0]])
+    grid = meshio.Mesh(points, [("polygon", np.array([[1, 2, 3, 4, 5, 0]]))])
+    poly = pyvista.PolyData(np.c_[points, np.zeros(6)], [6, 1, 2, 3, 4, 5, 0])
+    for source in (grid, poly):
+        assert ltl.as_mesh(source).area == pytest.approx(3)
+
+
+@pytest.mark.parametrize("source", [None, "ball.obj", {"vertices": np.zeros((3, 3))}, np.zeros((5, 3))])
+def test_what_is_no_mesh_is_refused_with_what_was_expected(source):
+    with pytest.raises(ltl.MeshError, match="a mesh of trimesh, PyVista, meshio or Open3D"):
+        ltl.as_mesh(source)
+
+
+def test_fields_without_names_are_answered_by_how_to_name_them(tmp_path):
+    with pytest.raises(TypeError, match=r'Expected fields by name, such as \{"u": u\}'):
+        ltl.save(tmp_path / "a.vtp", MESH, MESH.vertices[:, 0])
+    with pytest.raises(ValueError, match=r"times of shape \(T,\), one at least"):
+        ltl.save(tmp_path / "a.vtp", MESH, {"u": np.zeros((0, 162))}, times=[])
+
+
+def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path):
+    for name in ("a.npz", "a.ply", "a.zarr"):
+        if name == "a.zarr":
+            pytest.importorskip("zarr")
+        ltl.save(tmp_path / name, MESH, FIELDS)
+        with pytest.raises(ValueError, match="times"):
+            ltl.save(tmp_path / name, MESH, {"times": MESH.vertices[:, 0]})
+        ltl.save(tmp_path / name, MESH, {"height": MESH.vertices[:, 0]})
+        np.testing.assert_array_equal(ltl.load_fields(tmp_path / name)["height"], MESH.vertices[:, 0])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "a.ply", "a.zarr"]
+
+
+@pytest.mark.parametrize(("name", "folder"), [("a.zarr", "a.zarr"), ("a.pvd", "a_series")])
+def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path, name, folder):
+    pytest.importorskip("zarr")
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match="which save did not write"):
+        ltl.save(tmp_path / name, MESH, FIELDS)
+    assert (tmp_path / folder / "thesis.txt").read_text() == "mine"
+    (tmp_path / folder / "thesis.txt").unlink()
+    (tmp_path / folder).rmdir()
+    for _ in range(2):
+        ltl.save(tmp_path / name, MESH, FIELDS)
+    (tmp_path / folder / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match="which save did not write"):
+        ltl.save(tmp_path / name, MESH, FIELDS)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.gii", "a.vtp", "a.ply", "a.glb"])
+def test_shapes_far_from_the_origin_keep_their_shape(tmp_path, name):
+    far = ltl.Mesh(MESH.vertices + np.array([5e6, 4e6, 0]), MESH.faces)
+    ltl.save(tmp_path / name, far)
+    loaded = ltl.load_mesh(tmp_path / name)
+    assert loaded.num_vertices == far.num_vertices
+    shift = 0 if name == "a.stl" else np.array([5e6, 4e6, 0])
+    order = slice(None) if name != "a.stl" else np.lexsort(np.round(loaded.vertices, 4).T)
+    expected = MESH.vertices if name != "a.stl" else MESH.vertices[np.lexsort(np.round(MESH.vertices, 4).T)]
+    middle = np.round(expected.mean(axis=0) - (loaded.vertices[order] - shift).mean(axis=0), 6)
+    np.testing.assert_allclose(loaded.vertices[order] - shift + middle, expected, atol=2e-6)
+
+
+def test_a_crafted_file_of_fields_reads_no_other_file(tmp_path):
+    np.arange(9, dtype="<f4").tofile(tmp_path / "secret.bin")
+    text = (
+        '<?xml version="1.0"?><GIFTI Version="1.0" NumberOfDataArrays="1"><DataArray Intent="NIFTI_INTENT_SHAPE" '
+        'DataType="NIFTI_TYPE_FLOAT32" ArrayIndexingOrder="RowMajorOrder" Dimensionality="1" Dim0="9" '
+        'Encoding="&#69;xternalFileBinary" Endian="LittleEndian" ExternalFileName="secret.bin" '
+        'ExternalFileOffset="0"><Data></Data></DataArray></GIFTI>'
+    )
+    (tmp_path / "a.gii").write_text(text)
+    with pytest.raises(DataError, match="another file, which is not read"):
+        ltl.load_fields(tmp_path / "a.gii")
+
+
+def test_integers_and_flags_come_back_from_columns(tmp_path):
+    flags, labels = MESH.vertices[:, 0] > 0, np.arange(162, dtype=np.int32)
+    ltl.save(tmp_path / "a.ply", MESH, {"flags": flags, "labels": labels, "long": np.arange(162)})
+    loaded = ltl.load_fields(tmp_path / "a.ply")
+    assert loaded["labels"].dtype.kind == "i"
+    for name, values in (("flags", flags), ("labels", labels), ("long", np.arange(162))):
+        np.testing.assert_array_equal(loaded[name], values)
+
+
+def test_other_kinds_of_other_packages_say_what_to_do():
+    pyvista = pytest.importorskip("pyvista")
+    poly = pyvista.PolyData.from_regular_faces(MESH.vertices, MESH.faces)
+    with pytest.raises(ltl.MeshError, match="extract_surface"):
+        ltl.as_mesh(poly.cast_to_unstructured_grid())
+    assert ltl.as_mesh(poly.strip()).area == pytest.approx(MESH.area)
+    quads = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]])
+    points = np.array([[i, j, 0.0] for j in range(3) for i in range(3)])
+    assert ltl.as_mesh((points, quads)).area == pytest.approx(4)
