@@ -60,15 +60,14 @@ def test_no_stage_polynomial_grows_inside_its_parabola(solver, bound, width):
     assert float(plan.c[int(plan.stages)]) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("dt", [1e-3, 1e-2, 1e-1, 1.0])
-def test_fixed_steps_keep_the_range_of_heat_on_random_points_or_are_refused(dt):
-    for seed in range(4):
+@pytest.mark.parametrize(("dt", "count"), [(1e-3, 4), (1e-2, 4), (1e-1, 2), (1.0, 1)])
+def test_fixed_steps_of_any_length_keep_the_range_of_heat_on_random_points(dt, count):
+    for seed in range(count):
         surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(700, seed=seed))
         for solver in (ltl.RKL2(), ltl.RKL1()):
             found = largest(surface, noise(surface, seed), dt, solver)
-            assert found is None or found <= RANGE
-            # At short steps none is refused.
-            assert found is not None or dt > 0.05
+            assert found is not None
+            assert found <= RANGE
 
 
 @pytest.mark.parametrize(
@@ -129,12 +128,13 @@ def test_steps_of_rough_data_and_of_sources_that_begin_are_not_taken_for_nonsens
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [1e-3, 1e-2, 3e-2, 1e-1, 1.0])
-def test_a_hundred_random_spheres_keep_the_range_of_heat_or_refuse(dt):
+def test_a_hundred_random_spheres_keep_the_range_of_heat(dt):
     for seed in range(100):
         surface = ltl.Surface.from_mesh(ltl.shapes.random_sphere(3000, seed=seed))
         for solver in (ltl.RKL2(), ltl.RKL1()):
             found = largest(surface, noise(surface, seed), dt, solver)
-            assert found is None or found <= RANGE
+            assert found is not None
+            assert found <= RANGE
 
 
 @pytest.mark.parametrize("solver", [ltl.RKL1(), ltl.RKL2()], ids=["RKL1", "RKL2"])

@@ -1,6 +1,7 @@
 """Steppers: order in time, stability, the maximum principle, and derivatives through all of them."""
 
 import dataclasses
+import re
 import sys
 
 import diffrax
@@ -138,12 +139,16 @@ def test_stages_grow_with_the_square_root_of_the_stiffness(sphere, solver):
     assert 8 < counts[1] / counts[0] < 13
 
 
-def test_a_fixed_step_beyond_all_stages_is_refused(sphere):
-    def end(diffusivity):
-        return ltl.solve(ltl.Diffusion(diffusivity), sphere, sphere.vertices[:, 0], 1.0, solver=ltl.RKL2(), dt=1.0)
+def test_a_fixed_step_beyond_all_stages_is_taken_in_parts(sphere):
+    def end(diffusivity, t1=1.0):
+        return ltl.solve(ltl.Diffusion(diffusivity), sphere, sphere.vertices[:, 0], t1, solver=ltl.RKL2(), dt=t1)
 
+    found = end(1e5)
+    parts = int(re.search(r"each step in (\d+) parts", found.method)[1])
+    assert found.counts["num_steps"] == parts > 1
+    assert np.abs(found.u_end).max() < 1e-3
     with pytest.raises(ValueError, match="too long for RKL2, which is stable up to"):
-        end(1e5)
+        end(1e5, 1e9)
     # Traced, where nothing can be raised, the state says so.
     assert not jnp.isfinite(jax.jit(lambda d: end(d).u_end)(1e5)).any()
 

@@ -5,6 +5,7 @@ Where nothing is said the normal derivative vanishes. Of two conditions for the 
 """
 
 import functools
+import inspect
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -253,9 +254,21 @@ def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:
     return mask & everywhere if callable(where) else mask
 
 
+def _called(data: Callable, t: Any, surface: Surface) -> Any:
+    """What a function of time and place returns."""
+    try:
+        inspect.signature(data).bind(t, surface.vertices)
+    except TypeError:
+        raise TypeError(
+            "Expected data of a boundary condition as a number, an array or a function (t, vertices) -> array, found a "
+            f"function {inspect.signature(data)}."
+        ) from None
+    return data(t, surface.vertices)
+
+
 def _data(data: Data, t, surface: Surface, u: Array, *, may_be_gradient: bool = False) -> Array:
     """The data of a condition at a time, in the shape of the state (or of its gradient)."""
-    values = jnp.asarray(data(t, surface.vertices) if callable(data) else data, u.dtype)
+    values = jnp.asarray(_called(data, t, surface) if callable(data) else data, u.dtype)
     if may_be_gradient and values.shape == (*u.shape, 3):
         return values
     if values.shape == u.shape[:1] and u.ndim == 2:

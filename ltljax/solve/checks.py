@@ -11,20 +11,50 @@ from jaxtyping import Array, ArrayLike
 
 from ..elliptic import EllipticStencil
 from ..equations import Equation
-from ..mesh.arguments import as_numbers
+from ..mesh.arguments import as_numbers, at_least
 from ..surface import Surface
 from ..tables import AnyArray
 from .stabilised import Stabilised
 
 # Products with the rate's derivative from which the stiffest mode is estimated.
 _PRODUCTS = 30
+# A step that would have to be taken in more parts is a mistake.
+_MOST_PARTS = 100_000
 
 
 def field(surface: Surface, u: Any, name: str) -> Array:
     """A field over a surface as an array (V,) or (V, S) in its float type, if it is one."""
+    if u is None:
+        raise TypeError(f"Expected {name} as real numbers, found None.")
     u = jnp.asarray(as_numbers(name, u), surface.dtype)
     state(surface, u)
     return u
+
+
+def kinds(equation: Any, solver: Any, adjoint: Any, max_steps: Any, stop_when: Any) -> None:
+    """Raise where an argument of `solve` is of the wrong kind."""
+    if not isinstance(equation, Equation):
+        raise TypeError(f"Expected an equation such as ltl.Diffusion(), found {equation!r:.80}.")
+    for name, value, kind, example in (
+        ("solver", solver, diffrax.AbstractSolver, "ltl.RKL2()"),
+        ("adjoint", adjoint, diffrax.AbstractAdjoint, "diffrax.ForwardMode()"),
+    ):
+        if value is not None and not isinstance(value, kind):
+            what = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.80}"
+            raise TypeError(f"Expected as {name} an instance such as {example}, found {what}.")
+    if max_steps is not None:
+        at_least("max_steps", max_steps, 1)
+    if stop_when is not None and not callable(stop_when):
+        raise TypeError(f"Expected stop_when as a function (t, u, rate) -> bool, found {stop_when!r:.80}.")
+
+
+def one_number(name: str, value: Any) -> None:
+    """Raise where a time or a length of steps is no single number."""
+    if value is None:
+        raise TypeError(f"Expected {name} as real numbers, found None.")
+    as_numbers(name, value)
+    if np.ndim(value) != 0:
+        raise ValueError(f"Expected {name} as one number, found an array of shape {np.shape(value)}.")
 
 
 def state(surface: Surface, u0: Array) -> None:
@@ -65,6 +95,7 @@ def tolerances(rtol: ArrayLike, atol: ArrayLike | None) -> None:
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         if tolerance is None:
             continue
+        as_numbers(name, tolerance)
         if not isinstance(tolerance, Tracer) and not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) > 0)):
             raise ValueError(
                 f"Expected a positive tolerance, found {name} = {tolerance}: steps would have to be without error. For "
@@ -106,28 +137,43 @@ def _diffuses_forwards(diffusivity: ArrayLike, where: str, u0: Array) -> None:
     )
 
 
-def step(
+def parts_of_a_step(
     equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, dt: float, solver: diffrax.AbstractSolver
-) -> None:
-    """Raise where steps of an explicit method are too long for the stiffest mode of the first state."""
+) -> int:
+    """The number of equal parts to split a step into.
+
+    More than one where `RKL2` or `RKL1` is unstable for the whole step even with the most stages, judged by the
+    stiffest mode of the initial state; 1 where that is unknown.
+
+    Raises:
+        ValueError: the step is too long for an explicit method without stages to choose from, or a stabilised one would
+            take more than 100,000 parts.
+    """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, dt))):
-        return
+        return 1
     # What is traced may be reached through a closure too.
     t0 = jnp.asarray(t0, u0.dtype)
     if isinstance(solver, Stabilised):
         longest, others = solver.longest_step(solver.extent(t0, u0, (equation, surface))), "ltl.TRBDF2()"
+        if isinstance(longest, Tracer) or not (np.isfinite(longest) and longest > 0):
+            return 1
+        # With a margin for the rounding of the times between parts.
+        parts = 1 if dt <= longest else np.ceil(1.02 * dt / float(longest))
+        if parts <= _MOST_PARTS:
+            return int(parts)
     elif isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
         stiffest, width = _stiffest(equation, surface, u0, t0), equation.spectral_width(t0, surface, u0)
         if isinstance(stiffest, Tracer) or isinstance(width, Tracer):
-            return
+            return 1
         longest, others = 1.02 * longest_step(solver, float(stiffest), float(width)), "ltl.RKL2() or ltl.TRBDF2()"
     else:
-        return
-    if not isinstance(longest, Tracer) and dt > longest:
+        return 1
+    if dt > longest:
         raise ValueError(
             f"dt = {dt:g} is too long for {type(solver).__name__}, which is stable up to {float(longest):.2g} on "
             f"this surface. Take shorter steps, leave dt out for adaptive ones, or use {others}."
         )
+    return 1
 
 
 @jax.jit

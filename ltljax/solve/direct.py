@@ -21,7 +21,7 @@ from ..equations import Diffusion
 from ..equations import boundary as bounds
 from ..lifting.schemes import Paper
 from ..operators import laplacian_matrix
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .evolve import what_is_fixed
 from .krylov import Preconditioner
@@ -67,6 +67,7 @@ class Factorized(Preconditioner):
         return jax.pure_callback(on_host, like, self.number, columns, vmap_method="expand_dims").reshape(r.shape)
 
 
+@on_surface
 def factorized(
     surface: Surface, screening: AnyArray | float = 0.0, boundary: bounds.Conditions | None = None
 ) -> Factorized:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..lifting.delaunay import HalfEdges, delaunay_triangulation
 from ..lifting.jets import INTERIOR
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 
 # A distance is corrected where it falls by more than this share, which is rounding.
@@ -27,6 +27,7 @@ _SLACK = 1e-9
 _NEVER_AROUND = 1e3
 
 
+@on_surface
 def geodesic_distance(
     surface: Surface,
     sources: Int[AnyArray, " n"] | Sequence[int] | int,
@@ -87,6 +88,8 @@ def checked_sources(surface: Surface, sources: Any) -> np.ndarray:
         ValueError: there are none, or they are not on the surface.
     """
     sources = np.atleast_1d(np.asarray(sources))
+    if sources.dtype.kind not in "iu":
+        raise ValueError(f"Expected the numbers of source vertices, found {sources!r:.80}.")
     if sources.size == 0 or sources.min() < 0 or sources.max() >= surface.num_vertices:
         raise ValueError(f"Expected source vertices from 0 to {surface.num_vertices - 1}, found {sources}.")
     return sources

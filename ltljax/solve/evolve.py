@@ -17,16 +17,18 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..equations import Equation
 from ..equations import boundary as bounds
+from ..folder import Folder
 from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..mesh.arguments import as_numbers
 from ..operators import growth_rate, spectral_bound, spectral_width
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from . import checks, taped
+from .fingerprint import fingerprint
 from .implicit import SBDF2, SHARE, TRBDF2, ImplicitRungeKutta, Preconditioning, without_matrices
 from .krylov import rms
 from .multigrid import Multigrid, is_available, multigrid
-from .restart import Keeper, fingerprint, in_intervals
+from .restart import Keeper, RestartError, in_intervals
 from .stabilised import RKL2, Stabilised, differentiable
 from .steps import Advancing, TextMeter, without_twins
 
@@ -53,6 +55,8 @@ _FEWEST_CHECKPOINTS = 32
 
 # Intervals of a run that is kept on disk.
 _INTERVALS = 20
+# Fixed steps of more parts in all than this are a mistake.
+_MOST_STEPS = 10_000_000
 
 Condition = Callable[[Array, Array, Array], Bool[Array, ""]]
 
@@ -165,6 +169,7 @@ class Solution(eqx.Module):
             )
 
 
+@on_surface
 def solve(
     equation: Equation,
     surface: Surface,
@@ -186,6 +191,7 @@ def solve(
     checkpoint_dir: str | Path | None = None,
     checkpoint_every: float | None = None,
     resume: bool = False,
+    run_id: str | None = None,
     throw: bool = True,
 ) -> Solution:
     """The solution of an evolution equation at given times.
@@ -221,7 +227,10 @@ def solve(
             `diffrax.ForwardMode()` for few parameters.
         progress: True for a progress bar, or a diffrax progress meter.
         t0: the first time.
-        dt: the length of steps, for fixed ones; the last before each of ``ts`` may be shorter.
+        dt: the length of steps, for fixed ones; the last before each of ``ts`` may be shorter. A step of `RKL2` or
+            `RKL1` that is too long even for the largest number of stages is split into equal parts that are stable at
+            the initial state; ``solution.stats`` says how many. Inside jit, where that is not known, the run ends with
+            NaN.
         rtol: relative tolerance of a step; implicit stages are solved to a hundredth of it.
         atol: absolute tolerance of a step; by default a hundredth of ``rtol`` times the largest that each species has
             been in the run so far, so that a change of its unit changes nothing else.
@@ -238,7 +247,11 @@ def solve(
         checkpoint_every: the length of these intervals in time, which also end at ``ts``; by default a twentieth of the
             run.
         resume: whether to go on from what ``checkpoint_dir`` holds of the same call; the result is the same as that of
-            a run that was not interrupted.
+            a run that was not interrupted. Two calls are the same when all arrays and options are, and the functions
+            in ``equation``, ``solver`` and ``stop_when`` have the same source. Values that such a function reads from
+            its module are not compared, nor are the methods of a class.
+        run_id: a name that stands for the equation, solver and ``stop_when`` when runs are compared. Use it where the
+            source of a function is not available, or changes without changing what it does.
         throw: whether to raise when the run does not reach t1. Inside jit nothing can be raised: read
             ``solution.result`` and ``solution.overflowed`` there.
 
@@ -250,19 +263,25 @@ def solve(
         ValueError: the state does not fit the surface, something is not finite, a diffusivity is negative anywhere,
             times are not in order, tolerances are not positive, dt is beyond the stability of an explicit solver, or
             solver and dt do not go together.
-        RestartError: ``checkpoint_dir`` holds the files of another run.
+        RestartError: ``checkpoint_dir`` holds the files of another run, or of one that has not ended and was not to be
+            resumed; or this run cannot be told from others without a ``run_id``.
+        OutputError: another run is writing to ``checkpoint_dir``, or files that ltljax has not written have the names
+            of its own there.
 
     Warns:
         GrowingModesWarning: of a ``Polynomial`` surface, whose Laplacian has growing modes. The spectrum is looked at
             once for each surface, and not inside jit.
     """
+    checks.kinds(equation, solver, adjoint, max_steps, stop_when)
     u0 = checks.field(surface, u0, "u0")
     if checkpoint_dir is None and (resume or checkpoint_every is not None):
         given = "resume=True" if resume else f"checkpoint_every={checkpoint_every}"
         raise ValueError(f"{given} needs the folder that the run is kept in: give checkpoint_dir.")
     # In NumPy where they are known, which inside jit they would not be as JAX's arrays.
-    for time_name, time in (("t0", t0), ("t1", t1), ("ts", ts), ("dt", dt)):
-        as_numbers(time_name, time)
+    for name, time in (("t0", t0), ("t1", t1), *((("dt", dt),) if dt is not None else ())):
+        checks.one_number(name, time)
+    if ts is not None:
+        as_numbers("ts", ts)
     times = [t1] if ts is None else ts
     is_known = not any(isinstance(time, Tracer) for time in jax.tree.leaves(times))
     times = (np if is_known else jnp).asarray(times, surface.dtype)
@@ -284,18 +303,21 @@ def solve(
         method, why = without_matrices(solver), "chosen by the caller"
     if isinstance(method, SBDF2) and dt is None:
         raise ValueError("SBDF2 takes fixed steps: give their length as dt, or use diffrax.KenCarp3().")
+    parts = 1
     if isinstance(method, ImplicitRungeKutta | SBDF2):
         inverse = hierarchy(equation, surface, u0, t0) if preconditioner is None else preconditioner
         method = dataclasses.replace(method, preconditioning=Preconditioning(inverse, relative, absolute))
         why += f", stages preconditioned by {'Jacobi' if inverse is None else 'multigrid'}"
     elif dt is not None:
-        checks.step(equation, surface, u0, t0, dt, method)
+        parts = checks.parts_of_a_step(equation, surface, u0, t0, dt, method)
+        if parts > 1:
+            why += f", each step in {parts} parts, since a whole one is unstable even with the most stages"
     if not surface.is_traced and isinstance(method, Stabilised):
         surface = eqx.tree_at(
             lambda s: s.geometry.spectral_width, surface, spectral_width(surface), is_leaf=lambda leaf: leaf is None
         )
     name = f"{type(method if solver is None else solver).__name__}: {why}"
-    grid = _grid(t0, t1, times, dt)
+    grid = _grid(t0, t1, times, dt, parts)
     is_taped = (
         adjoint is None
         and max_steps is not None
@@ -339,19 +361,31 @@ def solve(
             raise ValueError("A run that is kept on disk cannot be traced by a JAX transformation, nor be dense.")
         run = dict(
             mesh=fingerprint((surface.vertices, surface.centre, surface.faces, repr(surface.scheme))),
-            equation=fingerprint(equation),
+            equation=_fingerprint(equation, run_id),
             start=fingerprint((u0, float(t0))),  # type: ignore
             end=fingerprint((float(t1), times, dt, checkpoint_every)),  # type: ignore
-            solver=fingerprint((solver, type(method), "Jacobi" in why, rtol, atol, stop_when)),
+            solver=_fingerprint((solver, stop_when), run_id),
+            tolerances=fingerprint((type(method), "Jacobi" in why, rtol, atol)),
         )
-        keeper = Keeper(checkpoint_dir, run, resume)
         # As the steps have them: in the state's float type.
         begin, end = (float(np.asarray(time, times.dtype)) for time in (t0, t1))
         every = (end - begin) / _INTERVALS if checkpoint_every is None else checkpoint_every
-        solution = in_intervals(advance, keeper, u0, begin, end, times, grid, every)
+        with Folder(checkpoint_dir).locked() as folder:
+            keeper = Keeper(folder, run, resume)
+            if keeper.passed_over:
+                passed = ", ".join(path.name for path in keeper.passed_over)
+                warnings.warn(f"Passed over in {checkpoint_dir}, as they are damaged: {passed}.", stacklevel=2)
+            solution = in_intervals(advance, keeper, u0, begin, end, times, grid, every)
     if throw and not isinstance(solution.t_end, Tracer):
         solution.check(surface)
     return solution
+
+
+def _fingerprint(value: Any, run_id: str | None) -> str:
+    try:
+        return fingerprint(value if run_id is None else run_id)
+    except TypeError as error:
+        raise RestartError(f"The run cannot be identified. {error} Name it with run_id=...") from None
 
 
 @eqx.filter_jit
@@ -402,8 +436,9 @@ def what_is_fixed(
     return absorption, np.asarray(is_held)
 
 
-def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.ndarray | None:
-    """The times of fixed steps: multiples of dt, and the times asked for; None for adaptive steps."""
+def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None, parts: int) -> np.ndarray | None:
+    """The times of fixed steps: multiples of dt, and the times asked for, with each step between in equal parts; None
+    for adaptive steps."""
     if dt is None:
         return None
     if any(isinstance(value, Tracer) for value in (t0, t1, ts, dt)):
@@ -414,7 +449,14 @@ def _grid(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> np.nd
     count = int(np.ceil((end - start) / dt - 1e-6))
     multiples = np.asarray(float(start) + dt * np.arange(1, count), ts.dtype)
     least = max(1e-6 * dt, 4 * float(np.finfo(ts.dtype).eps) * float(max(abs(start), abs(end))))
-    return without_twins(start, end, (np.asarray(ts), multiples), least)
+    grid = without_twins(start, end, (np.asarray(ts), multiples), least)
+    if parts > 1 and (dt / parts < least or len(grid) * parts > _MOST_STEPS):
+        raise ValueError(
+            f"dt = {dt:g} is too long: each step would be taken in {parts} parts. Take shorter steps, leave dt out for "
+            "adaptive ones, or use ltl.TRBDF2()."
+        )
+    within = grid[:-1, None] + np.diff(grid)[:, None] * (np.arange(parts) / parts)
+    return np.append(within.ravel(), grid[-1]).astype(grid.dtype)
 
 
 def _checkpoints(grid: np.ndarray | None, max_steps: int | None, u0: Array) -> diffrax.AbstractAdjoint:

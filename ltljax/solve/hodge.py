@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..curvature import curvature
 from ..equations import Dirichlet, Neumann
 from ..operators import divergence, gradient
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from ..vectors import check_vectors, curl, tangential
 from .direct import Factorized
@@ -55,6 +55,7 @@ class HarmonicFields(eqx.Module):
     measure: Float[Array, " V"]
 
 
+@on_surface
 def harmonic_fields(surface: Surface) -> HarmonicFields:
     """The tangent fields with neither divergence nor curl: two for every handle (host). Second order.
 
@@ -90,6 +91,7 @@ def _harmonic(surface: Surface, number: int) -> HarmonicFields:
     return HarmonicFields(jnp.asarray(fields, surface.dtype), surface.mass)
 
 
+@on_surface
 def helmholtz_hodge(
     surface: Surface,
     X: Float[AnyArray, "V 3"],

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ..equations import boundary as bounds
 from ..operators import laplacian, laplacian_matrix
-from ..surface import Surface
+from ..surface import Surface, on_surface
 
 # Below this size all eigenvalues are computed at once.
 _DENSE = 300
@@ -51,6 +51,7 @@ class Eigenmodes(eqx.Module):
         return -jnp.sum(self.left * acted, axis=0) / jnp.sum(self.left * self.vectors, axis=0)
 
 
+@on_surface
 def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None = None) -> Eigenmodes:
     """The k lowest eigenvalues of -Delta and their modes (host): second order with ``Monotone``.
 
@@ -69,6 +70,8 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
             "them outside, and use modes.values_on(surface) inside."
         )
     size = surface.num_vertices
+    if isinstance(k, bool) or not isinstance(k, int | np.integer):
+        raise ValueError(f"Expected a whole number of modes, found {k!r}.")
     if not 1 <= k <= size - 2:
         raise ValueError(f"Expected a number of modes from 1 to {size - 2}, found {k}.")
     conditions = bounds.as_tuple(boundary)

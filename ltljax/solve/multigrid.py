@@ -28,7 +28,7 @@ from ..lifting.layout import PerBlock
 from ..lifting.schemes import Monotone
 from ..mesh import Mesh
 from ..operators import laplacian_matrix
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import (
     AnyArray,
     ReverseWeights,
@@ -192,6 +192,7 @@ def is_available() -> bool:
     return importlib.util.find_spec("pyamg") is not None
 
 
+@on_surface
 def multigrid(surface: Surface, absorption: np.ndarray | None = None, is_held: np.ndarray | None = None) -> Multigrid:
     """The hierarchy of a surface, set up once for its weights (host) and kept as long as they live.
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..equations import ReactionDiffusion
 from ..equations.kinetics import Kinetics
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .modes import eigenmodes
 
@@ -193,6 +193,7 @@ class Explanation:
         return self.message
 
 
+@on_surface
 def explain(
     equation: ReactionDiffusion,
     surface: Surface,

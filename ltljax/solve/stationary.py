@@ -22,7 +22,7 @@ from ..equations import boundary as bounds
 from ..equations.spreads import are_numbers, spread_bound
 from ..lifting.schemes import Monotone, Paper, Polynomial
 from ..operators import spectral_bound
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from . import checks
 from .direct import Factorized, factor
@@ -53,6 +53,7 @@ class IncompatibleSourceWarning(UserWarning):
     """The right side of a Poisson equation has a mean, so that there is no solution."""
 
 
+@on_surface
 def poisson(
     surface: Surface,
     f: Float[AnyArray, "V *S"],
@@ -94,6 +95,7 @@ def poisson(
     return _elliptic(surface, f, 0.0, boundary, tolerance, preconditioner, throw)
 
 
+@on_surface
 def screened_poisson(
     surface: Surface,
     f: Float[AnyArray, "V *S"],
@@ -259,6 +261,7 @@ def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum
     return reduce(values, surface.topology.components, num_segments=surface.topology.num_components)
 
 
+@on_surface
 def steady_state(
     equation: Equation,
     surface: Surface,

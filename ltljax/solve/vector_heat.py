@@ -19,7 +19,7 @@ from ..equations import VectorDiffusion
 from ..lifting.frames import transport
 from ..mesh import k_ring, one_rings
 from ..operators import laplacian_matrix
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray, difference_matrix
 from ..vectors import check_tangent, connection, from_frame, power, to_frame
 from .distance import checked_sources
@@ -35,6 +35,7 @@ _DECAY = 500
 _SHIFT = 1e-3
 
 
+@on_surface
 def transport_vectors(
     surface: Surface,
     sources: Int[AnyArray, " n"] | Sequence[int] | int,
@@ -163,6 +164,7 @@ def _step(operator: Any, time: float) -> Any:
     return scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(stepped), diag_pivot_thresh=0.0)
 
 
+@on_surface
 def connection_matrix(surface: Surface, symmetry: int = 1) -> scipy.sparse.csr_array:
     """The vector Laplacian as a complex sparse matrix (V, V) on the components in the frames (host)."""
     with jax.ensure_compile_time_eval():
@@ -172,6 +174,7 @@ def connection_matrix(surface: Surface, symmetry: int = 1) -> scipy.sparse.csr_a
     return scipy.sparse.csr_array(x + 1j * y + scipy.sparse.diags_array(left[0] + 1j * left[1]))
 
 
+@on_surface
 def direction_field(
     surface: Surface, symmetry: int = 4, guide: Float[AnyArray, "V 3"] | None = None, time: float | None = None
 ) -> Float[Array, "V 3"]:
