@@ -15,7 +15,7 @@ from .lifting.jets import INTERIOR, height_jet, jet_weights
 from .lifting.ring import RingTopology, angle_sums, lifted_ring, offsets, take_slots
 from .lifting.schemes import Monotone
 from .operators import second_derivatives
-from .surface import Surface
+from .surface import Surface, on_device, on_surface
 from .tables import AnyArray, Block, Table
 
 
@@ -37,6 +37,7 @@ class Curvature(eqx.Module):
     directions: Float[Array, "V 2 3"]
 
 
+@on_surface
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
@@ -133,7 +134,7 @@ class PolyhedralCurvature(eqx.Module):
     turning: Float[Array, " V"]
 
 
-@eqx.filter_jit
+@on_device
 def polyhedral_curvature(surface: Surface) -> PolyhedralCurvature:
     """The curvature of a surface as the polyhedron it is, by angle defects and dihedral angles.
 

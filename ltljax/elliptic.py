@@ -20,7 +20,7 @@ from .lifting.schemes import Geometry, Topology, conormals_in_frame, flux_weight
 from .mesh import one_rings
 from .operators import MOST_MEASURED, gradient, measured_width
 from .progress import watched
-from .surface import Surface, on_device
+from .surface import Surface, on_device, on_surface
 from .tables import (
     AnyArray,
     ReverseWeights,
@@ -112,6 +112,7 @@ class EllipticStencil(eqx.Module):
         return EllipticStencil(self.table, self.paths, self.cotangent_rows, *numbers)
 
 
+@on_surface
 def elliptic_stencil(
     surface: Surface,
     diffusion: Float[AnyArray, "..."] | float,
@@ -194,6 +195,7 @@ def elliptic_stencil(
     return EllipticStencil(table, paths, cotangent_rows, *numbers)
 
 
+@on_surface
 def direction_tensor(
     surface: Surface, direction: Float[AnyArray, "V 3"], along: float | AnyArray, across: float | AnyArray
 ) -> Float[Array, "V 3 3"]:

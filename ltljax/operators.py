@@ -15,7 +15,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Array, Float
 
-from .surface import Surface, on_device
+from .surface import Surface, on_device, on_surface
 from .tables import AnyArray, difference_matrix, difference_sum, differences, slot_sum
 
 # Below this size all eigenvalues are computed at once.
@@ -237,6 +237,7 @@ def integrate(
     return jnp.tensordot(weights, u, axes=1)
 
 
+@on_surface
 def laplacian_matrix(surface: Surface) -> scipy.sparse.csr_array:
     """The Laplacian as a SciPy sparse matrix (V, V), for other people's solvers (host)."""
     geometry, topology = surface.geometry, surface.topology
@@ -259,6 +260,7 @@ def diagonal(surface: Surface) -> Float[Array, " V"]:
     return jnp.full(surface.num_vertices, -spectral_bound(surface) / 2)
 
 
+@on_surface
 def growth_rate(surface: Surface) -> float:
     """The largest real part among the Laplacian's eigenvalues, the constant field's zero aside where it is the largest
     (host). Positive where diffusion has growing modes; never with ``Monotone``.
@@ -295,6 +297,7 @@ def spectral_bound(surface: Surface) -> Float[Array, ""]:
     return (2 * jnp.max(spread) + jnp.max(jnp.abs(geometry.divergence_centre))) * 2 * jnp.max(steep)
 
 
+@on_surface
 def spectral_width(surface: Surface) -> Float[Array, ""]:
     """How far the Laplacian's eigenvalues lie off the real axis: a number chi, per unit time at diffusivity 1, such
     that each eigenvalue of negative real part has ``|Im|^2 <= chi |Re|``.

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from .mesh import Mesh
 from .solve import Dispersion, Solution
-from .surface import Surface
+from .surface import Surface, on_surface
 from .tables import AnyArray
 
 
@@ -88,6 +88,7 @@ def view(
     return Inline(page, height)
 
 
+@on_surface
 def displaced(surface: Surface, u: Float[AnyArray, " V"], amount: float = 0.1) -> Mesh:
     """The surface with a field as its relief, to be printed or rendered: a mesh (host).
 

@@ -7,10 +7,12 @@ everything is a pure function of them.
 import contextlib
 import dataclasses
 import functools
+import inspect
 import warnings
 import weakref
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,7 +27,11 @@ from .lifting.schemes import Geometry, Monotone, Scheme, Topology, weigh
 from .mesh import Mesh, far_middle
 from .mesh.arguments import as_numbers
 from .progress import Laps, watched
+from .records import read_record, write_record
 from .tables import AnyArray, difference_matrix, slot_sum
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class FarFromOriginWarning(UserWarning):
@@ -119,6 +125,42 @@ class Surface(eqx.Module):
         laps.end("weights")
         report = dataclasses.replace(report, seconds=laps.seconds)
         return cls(topology, geometry, centre_parts, scheme, report)
+
+    def save(self, path: str | Path) -> None:
+        """Write the surface to a file, with all its tables and weights; one that is there is replaced.
+
+        The file is an NPZ archive of arrays; it holds no code. Building a surface again takes far longer than loading.
+
+        Args:
+            path: the file; by custom it ends in ``.npz``.
+
+        Raises:
+            ValueError: the surface is being traced by a JAX transformation.
+            TypeError: its scheme is none of ltljax.
+
+        Example:
+            >>> import ltljax as ltl
+            >>> surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+            >>> surface.save("ball.npz")
+            >>> ltl.Surface.load("ball.npz").num_vertices
+            162
+        """
+        if self.is_traced:
+            raise ValueError("A surface that is being traced by a JAX transformation cannot be saved.")
+        write_record(Path(path), self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Surface":
+        """The surface in a file that `save` wrote, bit for bit.
+
+        Args:
+            path: the file.
+
+        Raises:
+            ValueError: there is no such file, it is damaged, it was written by another version of ltljax, or it holds
+                float64 while JAX has 64-bit numbers switched off.
+        """
+        return read_record(Path(path), cls)
 
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with its vertices moved and every weight recomputed, on the same support.
@@ -243,22 +285,53 @@ class Surface(eqx.Module):
         return self.geometry.vertices.dtype
 
 
-def on_device(function: Callable) -> Callable:
-    """The function jit-compiled; masked arrays, which would become arrays without their masks, are refused.
+def on_surface(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, with an error that says what was expected if its argument ``surface`` is not a `Surface`.
 
     Raises:
+        TypeError: the argument is no `Surface`.
+    """
+    place = list(inspect.signature(function).parameters).index("surface")
+
+    @functools.wraps(function)
+    def checked(*arguments: P.args, **named: P.kwargs) -> R:
+        # Where the argument is missing, the call itself says so.
+        is_given = "surface" in named or place < len(arguments)
+        given = named.get("surface", arguments[place] if place < len(arguments) else None)
+        if is_given and not isinstance(given, Surface):
+            advice = " Build one: ltl.Surface.from_mesh(mesh)." if isinstance(given, Mesh) else ""
+            raise TypeError(f"{function.__name__} expected a Surface as surface, found {_kind(given)}.{advice}")
+        return function(*arguments, **named)
+
+    return checked
+
+
+def on_device(function: Callable) -> Callable:
+    """The function jit-compiled, and checked by `on_surface` if it has a parameter ``surface``. Masked arrays, which
+    would become arrays without their masks, are refused.
+
+    Raises:
+        TypeError: an argument that should be an array is None, a sequence, a mapping, a set, a function or a text.
         ValueError: an argument is a masked array.
     """
+    parameters = inspect.signature(function).parameters
+    names = list(parameters)
+    are_arrays = {name for name, p in parameters.items() if p.default is p.empty and p.annotation is not str} - {
+        "surface"
+    }
     compiled = eqx.filter_jit(function)
 
     @functools.wraps(function)
     def checked(*arguments, **named):
-        for value in (*arguments, *named.values()):
+        for name, value in (*zip(names, arguments, strict=False), *named.items()):
             if isinstance(value, np.ma.MaskedArray):
                 as_numbers(f"the argument of {function.__name__}", value)
+            is_no_array = name in are_arrays and (value is None or isinstance(value, str | tuple))
+            if is_no_array or isinstance(value, list | dict | set) or inspect.isroutine(value):
+                raise TypeError(f"{function.__name__} expected an array as {name}, found {_kind(value)}.")
         return compiled(*arguments, **named)
 
-    return checked
+    return on_surface(checked) if "surface" in names else checked
 
 
 _weigh = eqx.filter_jit(weigh)
@@ -277,6 +350,12 @@ def _is_in_range(geometry: Geometry) -> bool:
     ]
     precision = np.finfo(geometry.vertices.dtype)
     return is_finite and all(size > precision.tiny / precision.eps for size in largest)
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "None"
+    return "a function" if inspect.isroutine(value) else f"a {type(value).__name__}"
 
 
 def _in_words(point: np.ndarray) -> str:

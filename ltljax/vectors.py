@@ -20,7 +20,7 @@ from .lifting.intrinsic import Paths
 from .lifting.layout import PerBlock
 from .lifting.schemes import places
 from .operators import divergence, gradient, laplacian
-from .surface import Surface, on_device
+from .surface import Surface, on_device, on_surface
 from .tables import AnyArray, ReverseWeights, Table, difference_sum, reverse_weights, slot_sum
 
 # The share of a vector that may stand on its tangent plane before it counts as a mistake.
@@ -180,6 +180,7 @@ def vector_laplacian(
     return from_frame(surface, along(to_frame(surface, X)))
 
 
+@on_surface
 def hodge_laplacian(surface: Surface, X: Float[AnyArray, "V *S 3"]) -> Float[Array, "V *S 3"]:
     """grad div X + n x grad curl X, the Laplacian that takes the gradient of u to that of Delta u; sign as `laplacian`.
 
@@ -252,6 +253,7 @@ def lie_bracket(surface: Surface, X: Float[AnyArray, "V 3"], Y: Float[AnyArray, 
     return along - jnp.einsum("vcd,vd->vc", covariant_derivative(surface, X), Y)
 
 
+@on_surface
 def transport_along(
     surface: Surface, path: Int[AnyArray, " n"], vector: Float[AnyArray, "*S 3"]
 ) -> Float[Array, "n *S 3"]:

@@ -1,4 +1,7 @@
-"""Strict JAX for every test: 64-bit, no silent promotion of dtype or rank, annotated shapes checked while running."""
+"""Strict JAX for every test: 64-bit, no silent promotion of dtype or rank.
+
+With LTLJAX_CHECK_SHAPES=1 the annotated shapes are checked while the tests run, which takes about half as long again.
+"""
 
 import gc
 import os
@@ -12,8 +15,9 @@ from jaxtyping import install_import_hook
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / "ltljax-tests-jax-cache"))
 os.environ.setdefault("EQX_ON_ERROR", "nan")
 
-with install_import_hook("ltljax", "beartype.beartype"):
-    import ltljax  # noqa: F401  (imported here first, so that the hook sees it)
+if os.environ.get("LTLJAX_CHECK_SHAPES") == "1":
+    with install_import_hook("ltljax", "beartype.beartype"):
+        import ltljax  # noqa: F401  (imported here first, so that the hook sees it)
 
 import jax
 import pytest
@@ -24,24 +28,40 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 MESHES = Path(__file__).parents[2] / "shared" / "meshes"
+CASES = Path(__file__).parents[2] / "shared" / "cases"
+
+
+# The files that take longest, which begin first, so that no process is left alone with one of them in the end.
+_LONGEST = ("notebooks", "robustness", "process", "recovery", "fit", "taped", "steppers", "scenarios", "distance")
+
+
+def pytest_collection_modifyitems(items):
+    """Order the files by how long they take; the tests of a file keep their order."""
+    rank = {f"test_{name}.py": index for index, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
+# Every compiled function keeps pages mapped. Linux allows a process 65,530 mappings and XLA crashes beyond them.
+_MOST_MAPPINGS = 25_000
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_compiled_functions():
-    """Compiled functions are let go of after each file: every one keeps pages mapped, and the kernel allows 65,530."""
+def clear_compiled_functions_of_a_file():
+    """Forget the compiled functions of a file of tests after it."""
     yield
-    _let_go()
+    _clear_compiled_functions()
 
 
 @pytest.fixture(autouse=True)
-def few_compiled_functions_of_a_slow_test(request):
-    """And after each slow test, which may compile hundreds."""
+def clear_compiled_functions_if_there_are_many():
+    """Forget compiled functions within a file, too, before there are more than the kernel allows."""
     yield
-    if request.node.get_closest_marker("slow"):
-        _let_go()
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+        _clear_compiled_functions()
 
 
-def _let_go():
+def _clear_compiled_functions():
     jax.clear_caches()
     gc.collect()
 
@@ -54,5 +74,17 @@ def real_mesh():
         if not (MESHES / name).exists():
             pytest.skip(f"the mesh {name} is not at hand")
         return MESHES / name
+
+    return path
+
+
+@pytest.fixture
+def case_file():
+    """The path of a small input by name; tests that ask for it are skipped where these are not at hand."""
+
+    def path(name: str) -> Path:
+        if not (CASES / name).exists():
+            pytest.skip(f"the file {name} is not at hand")
+        return CASES / name
 
     return path

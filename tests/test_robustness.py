@@ -29,7 +29,7 @@ def test_damaged_files_that_are_accepted_give_finite_operators(tmp_path):
     shapes = [ltl.shapes.jittered_sphere(1, 0.3, seed=0), ltl.shapes.disk(rings=3)]
     good = [(ending, write(s.vertices, s.faces)) for s in shapes for ending, write in WRITERS.values()]
     accepted = 0
-    for index in range(200):
+    for index in range(60):
         ending, data = good[index % len(good)]
         path = tmp_path / f"damaged{index}.{ending}"
         path.write_bytes(damaged(data, random))
@@ -39,10 +39,10 @@ def test_damaged_files_that_are_accepted_give_finite_operators(tmp_path):
             continue
         accepted += 1
         assert_sound(mesh)
-    assert accepted > 10
+    assert accepted > 5
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_crumpled_spheres_give_finite_operators(seed):
     random = np.random.default_rng(seed)
     sphere = ltl.shapes.icosphere(2)

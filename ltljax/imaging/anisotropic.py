@@ -9,7 +9,6 @@ Source: Weickert (1998), Anisotropic diffusion in image processing, Teubner, cha
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float
 from ..elliptic import EllipticStencil, elliptic_stencil
 from ..equations import Equation
 from ..operators import divergence, gradient
-from ..surface import Surface
+from ..surface import Surface, on_device, on_surface
 from ..tables import AnyArray
 from .signals import number, signal
 from .smoothing import evolved, smoothed
@@ -62,6 +61,7 @@ class AnisotropicDiffusion(Equation):
         return True
 
 
+@on_surface
 def structure_tensor(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -89,7 +89,7 @@ def structure_tensor(
     return _onto_tangent_planes(surface, smoothed(surface, products, integration_scale).reshape(-1, 3, 3))
 
 
-@eqx.filter_jit
+@on_device
 def diffusion_tensor(
     surface: Surface, structure: Float[AnyArray, "..."], contrast: float | AnyArray, enhancing: str = "edges"
 ) -> Float[Array, "V 3 3"]:
@@ -136,6 +136,7 @@ def diffusion_tensor(
     return (tensor + jnp.swapaxes(tensor, 1, 2)) / 2
 
 
+@on_surface
 def anisotropic_diffusion(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -175,6 +176,7 @@ def anisotropic_diffusion(
     return evolved(AnisotropicDiffusion(stencil), surface, u, time, None, rtol)
 
 
+@on_surface
 def edge_enhancing(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -203,6 +205,7 @@ def edge_enhancing(
     return _in_rounds(surface, u, time, rounds, lambda u: _tensor(surface, u, contrast, scale, 0.0, "edges"), options)
 
 
+@on_surface
 def coherence_enhancing(
     surface: Surface,
     u: Float[AnyArray, "V *C"],

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .signals import check, number, signal
 from .smoothing import mean_after
@@ -20,6 +20,7 @@ from .variation import denoise
 _UNIT = {jnp.dtype("float64"): 1e-6, jnp.dtype("float32"): 1e-4}
 
 
+@on_surface
 def diffuse_directions(
     surface: Surface, d: Float[AnyArray, "V *N"], time: float | AnyArray, steps: int = 8
 ) -> Float[Array, "V N"]:
@@ -60,6 +61,7 @@ def diffuse_directions(
     return found
 
 
+@on_surface
 def denoise_chromaticity(
     surface: Surface,
     colours: Float[AnyArray, "V *C"],

@@ -20,13 +20,14 @@ from ..solve import Multigrid, SolveError
 from ..solve.evolve import hierarchy
 from ..solve.implicit import Cycle, Jacobi
 from ..solve.krylov import Preconditioner, linear_solve
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .volume import check_volume, volumes, with_volumes
 
 _MOST_ITERATIONS = 1000
 
 
+@on_surface
 def mean_curvature_flow(
     surface: Surface,
     t1: float | int | AnyArray,
@@ -78,6 +79,7 @@ def mean_curvature_flow(
     return vertices
 
 
+@on_surface
 def fair(
     surface: Surface,
     strength: float | int | AnyArray,

@@ -16,7 +16,7 @@ from ..equations import Dirichlet
 from ..operators import diagonal, laplacian
 from ..solve.direct import Factorized, factorized
 from ..solve.stationary import poisson
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .minimiser import Faces, Functional, conjugate_gradients, minimise
 from .signals import check, missing, signal
@@ -29,6 +29,7 @@ _MAX_STEPS = 200
 _MAX_ITERATIONS = 5000
 
 
+@on_surface
 def inpaint(
     surface: Surface,
     u: Float[AnyArray, "V *C"],

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from ..tables.table import take
 from .noise import SolidNoise, solid_noise
@@ -34,6 +34,7 @@ _CONTRAST = 4.5
 Window = Literal["hann", "box"]
 
 
+@on_surface
 def line_integral_convolution(
     surface: Surface,
     X: Float[AnyArray, "V 3"],
@@ -140,6 +141,7 @@ def convolved(
     return total / weight
 
 
+@on_surface
 def lic_picture(
     surface: Surface,
     X: Float[AnyArray, "V 3"],

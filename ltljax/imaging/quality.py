@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .signals import number, same_shape, signal
 from .smoothing import smoothed
@@ -18,6 +18,7 @@ _RADIUS = 1.5
 _LUMINANCE, _CONTRAST = 0.01, 0.03
 
 
+@on_surface
 def mse(surface: Surface, u: Float[AnyArray, "V *C"], reference: Float[AnyArray, "..."]) -> Float[Array, ""]:
     """The mean of (u - reference)^2 over the area and the colours.
 
@@ -32,6 +33,7 @@ def mse(surface: Surface, u: Float[AnyArray, "V *C"], reference: Float[AnyArray,
     return _mse(surface, *_pair(surface, u, reference))
 
 
+@on_surface
 def psnr(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -53,6 +55,7 @@ def psnr(
     return 10 * jnp.log10(_peak(surface, reference, peak) ** 2 / _mse(surface, u, reference))
 
 
+@on_surface
 def ssim(
     surface: Surface,
     u: Float[AnyArray, "V *C"],

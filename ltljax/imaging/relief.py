@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..curvature import curvature
 from ..operators import gradient, hessian
-from ..surface import Surface
+from ..surface import Surface, on_device, on_surface
 from ..tables import AnyArray
 from .signals import number
 
@@ -27,6 +27,7 @@ class Ridges(eqx.Module):
     valley: Float[Array, " V"]
 
 
+@on_surface
 def ridges(surface: Surface, width: float | AnyArray = 1.0) -> Ridges:
     """Ridges and valleys as fields from 0 to 1.
 
@@ -69,7 +70,7 @@ def _ridges(surface: Surface, width: Array) -> Ridges:
     return Ridges(along(large, small, first), along(-small, -large, last))
 
 
-@eqx.filter_jit
+@on_device
 def shape_index(surface: Surface) -> Float[Array, " V"]:
     """The shape index (2 / pi) arctan((k1 + k2) / (k1 - k2)), from -1 to 1, whatever the size of the shape.
 

@@ -13,11 +13,12 @@ import scipy.sparse
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray, Table, build_table, difference_sum, differences, reversible, slot_sum
 from ..tables.table import take
 
 
+@on_surface
 def denoise_mesh(
     surface: Surface,
     similarity: float | AnyArray = 0.35,

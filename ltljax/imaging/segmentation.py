@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from ..operators import diagonal, laplacian
 from ..solve.implicit import Jacobi
 from ..solve.krylov import linear_solve
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .signals import check, number, signal
 
@@ -45,6 +45,7 @@ class Segmentation(eqx.Module):
         return self.phi > 0
 
 
+@on_surface
 def segment(
     surface: Surface,
     u: Float[AnyArray, "V *C"],

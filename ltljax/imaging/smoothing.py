@@ -18,7 +18,7 @@ from ..solve.evolve import solve
 from ..solve.implicit import Jacobi
 from ..solve.krylov import linear_solve
 from ..solve.stabilised import RKL1
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .signals import check, number, signal
 
@@ -26,6 +26,7 @@ _EXACT = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 _MAX_ITERATIONS = 1000
 
 
+@on_surface
 def smoothed(surface: Surface, u: Float[AnyArray, "V *C"], scale: float | AnyArray) -> Float[Array, "V *C"]:
     """The image averaged over a window of a given radius.
 
@@ -71,6 +72,7 @@ def mean_after(
     return jnp.where(is_found, u + found.value, jnp.nan), is_found
 
 
+@on_surface
 def diffuse(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -132,6 +134,7 @@ class PeronaMalik(Equation):
         return spectral_bound(surface).astype(u.dtype)
 
 
+@on_surface
 def perona_malik(
     surface: Surface,
     u: Float[AnyArray, "V *C"],
@@ -162,6 +165,7 @@ def perona_malik(
     return evolved(equation, surface, u, time, solver, rtol)
 
 
+@on_surface
 def sharpen(
     surface: Surface, u: Float[AnyArray, "V *C"], amount: float | AnyArray, scale: float | AnyArray
 ) -> Float[Array, "V *C"]:

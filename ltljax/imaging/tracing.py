@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from ..tables.table import take
 from ..vectors import check_tangent
@@ -42,6 +42,7 @@ class Streamlines(eqx.Module):
     is_valid: Bool[Array, "N T"]
 
 
+@on_surface
 def streamlines(
     surface: Surface,
     X: Float[AnyArray, "V 3"],

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..surface import Surface
+from ..surface import Surface, on_surface
 from ..tables import AnyArray
 from .minimiser import Faces, Functional, minimise
 from .signals import check, number, signal
@@ -29,6 +29,7 @@ _STRIDE = 2.0
 _SLACK = 1e-3
 
 
+@on_surface
 def denoise(
     surface: Surface,
     f: Float[AnyArray, "V *C"],
@@ -89,6 +90,7 @@ def denoise(
     return u
 
 
+@on_surface
 def noise_strength(
     surface: Surface,
     f: Float[AnyArray, "V *C"],
