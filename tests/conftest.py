@@ -20,6 +20,7 @@ if os.environ.get("LTLJAX_CHECK_SHAPES") == "1":
         import ltljax  # noqa: F401  (imported here first, so that the hook sees it)
 
 import jax
+import jaxtyping
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -64,6 +65,14 @@ def clear_compiled_functions_if_there_are_many():
 def _clear_compiled_functions():
     jax.clear_caches()
     gc.collect()
+
+
+@pytest.fixture
+def as_users_call_it():
+    """Without the checks of annotated types, so that the package's own errors are seen."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -3,20 +3,11 @@
 import inspect
 
 import jax.numpy as jnp
-import jaxtyping
 import pytest
 
 import ltljax as ltl
 
-
-@pytest.fixture(autouse=True)
-def as_users_call_it():
-    """Without the checks of annotated types that the other tests have."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-
-
+pytestmark = pytest.mark.usefixtures("as_users_call_it")
 MESH = ltl.shapes.icosphere(2)
 
 

@@ -661,6 +661,7 @@ def test_a_fine_part_beside_a_coarse_one_is_welded_in_no_time():
     assert mesh.num_vertices == fine.num_vertices + coarse.num_vertices
 
 
+@pytest.mark.usefixtures("as_users_call_it")
 @pytest.mark.parametrize("weld", [1, None, "yes", -1.0, np.nan])
 def test_a_distance_of_welding_is_a_positive_number_or_a_flag(weld):
     sphere = shapes.icosphere(1)

@@ -197,6 +197,7 @@ def test_what_is_no_mesh_is_refused_with_what_was_expected(source):
         ltl.as_mesh(source)
 
 
+@pytest.mark.usefixtures("as_users_call_it")
 def test_fields_without_names_are_answered_by_how_to_name_them(tmp_path):
     with pytest.raises(TypeError, match=r'Expected fields by name, such as \{"u": u\}'):
         ltl.save(tmp_path / "a.vtp", MESH, MESH.vertices[:, 0])

@@ -72,7 +72,7 @@ def _feed(update: Callable[[bytes], None], value: Any, within: list[int]) -> Non
         within.pop()
 
 
-def _is_exact(number: float) -> bool:
+def _is_exact(number: int | float) -> bool:
     try:
         return float(number) == number
     except OverflowError:
