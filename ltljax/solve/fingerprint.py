@@ -122,6 +122,8 @@ def _enclosed(function: types.FunctionType) -> dict[str, Any]:
 
 def _source(function: types.FunctionType) -> str:
     try:
+        if function.__code__.co_filename == "<string>":  # from exec, or from python -c, which later Pythons mix up
+            raise OSError
         source = inspect.getsource(function.__code__)  # its own, not that of a function that it wraps
     except OSError:
         raise TypeError(f"The source of the function {function.__qualname__} is not available.") from None
