@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
+from ltljax import scenario
 from ltljax.folder import Folder
 from ltljax.solve.fingerprint import fingerprint
 
@@ -103,11 +104,11 @@ u = "1 - 0.5*bumps"
 v = "0.5*bumps"
 [time]
 end = 2000
-frames = 400
+frames = 100
 """
 
 FITTED = (
-    SCENARIO.replace("end = 2000", "end = 60").replace("frames = 400", "frames = 1")
+    SCENARIO.replace("end = 2000", "end = 60").replace("frames = 100", "frames = 1")
     + """
 [fit]
 free = ["kinetics.feed", "kinetics.kill", "diffusivity.u", "diffusivity.v"]
@@ -123,9 +124,9 @@ time = 60
 def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, kills):
     """Of a run the last state, of a fit the numbers found, are those of a command that was left alone."""
     (tmp_path / "mine.toml").write_text(FITTED if command == "fit" else SCENARIO)
-    surface_free = ltl.scenario.read(SCENARIO.replace("end = 2000", "end = 60"), "mine.toml", tmp_path)
-    surface = ltl.Surface.from_mesh(surface_free.mesh)
-    us = ltl.solve(surface_free.make_equation(surface), surface, surface_free.u0, 60.0).u_end
+    example = scenario.read(SCENARIO.replace("end = 2000", "end = 60"), "mine.toml", tmp_path)
+    surface = ltl.Surface.from_mesh(example.mesh)
+    us = ltl.solve(example.make_equation(surface), surface, example.u0, 60.0).u_end
     np.savez(tmp_path / "seen.npz", u=1.01 * np.asarray(us[:, 0]), v=0.99 * np.asarray(us[:, 1]))
     code = "import sys; from ltljax.cli import main; sys.exit(main(sys.argv[1:]))"
 
@@ -155,7 +156,7 @@ def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, 
     assert killed >= kills // 2
     end(begin(tmp_path / "pieces", *(["--resume"] if restart.exists() else [])))
     if command == "run":
-        one, other = (tmp_path / out / "series" / "mine_0400.vtp" for out in ("whole", "pieces"))
+        one, other = (tmp_path / out / "series" / "mine_0100.vtp" for out in ("whole", "pieces"))
         assert one.read_bytes() == other.read_bytes()
     else:
         one, other = (json.loads((tmp_path / out / "fit.json").read_text()) for out in ("whole", "pieces"))
