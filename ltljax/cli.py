@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         said = "interrupted"
         if options.command in (_run, _fit):
-            said += "; what was written so far is kept. Go on with the same command and --resume, or begin anew with "
+            said += "; what was written so far is kept. Go on with the same command and --resume, or start over with "
             said += "--overwrite"
         print(f"ltljax: {said}.", file=sys.stderr)
         return 130
@@ -111,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     run_.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted: the same command, the same --out"
     )
-    run_.add_argument("--overwrite", action="store_true", help="begin anew where a run was interrupted")
+    run_.add_argument("--overwrite", action="store_true", help="start over, although an earlier run was interrupted")
 
     fit = commands.add_parser("fit", help="find numbers of a scenario file from what was seen")
     fit.set_defaults(command=_fit)
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, metavar="DIR", help="where to write (default: out/ and the scenario's name, and -fit)"
     )
     fit.add_argument("--resume", action="store_true", help="go on with a fit that was interrupted: the same --out")
-    fit.add_argument("--overwrite", action="store_true", help="begin anew where a fit was interrupted")
+    fit.add_argument("--overwrite", action="store_true", help="start over, although an earlier fit was interrupted")
 
     new = commands.add_parser("new", help="print a scenario file to start from: ltljax new gray-scott > my.toml")
     new.set_defaults(command=_new)

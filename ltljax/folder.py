@@ -48,7 +48,7 @@ class Folder:
         self.path = Path(path)
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path} is not a folder. Name another one.")
-        self._files, self._drafts, self._lock = {}, [], None
+        self._lock = None
         self._read()
 
     def _read(self) -> None:
@@ -77,8 +77,7 @@ class Folder:
         path = self.path / name
         if name not in self._files or path.is_symlink() or not path.is_file():
             return False
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest() in self._files[name]
+        return _digest_of(path) in self._files[name]
 
     def check(self, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
         """Raise where one of these files is there and is not ltljax's own, or is one of the inputs.
@@ -302,7 +301,7 @@ def _lock(file: IO[Any], waits: bool) -> bool:
         if os.name == "nt":
             import msvcrt
 
-            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if waits else msvcrt.LK_NBLCK, 1)  # type: ignore
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if waits else msvcrt.LK_NBLCK, 1)  # type: ignore (Windows only)
         else:
             import fcntl
 

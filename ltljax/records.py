@@ -100,7 +100,7 @@ def _made(tree: Any, arrays: list[np.ndarray]) -> Any:
     kind: Any = getattr(importlib.import_module(module), name)
     if not dataclasses.is_dataclass(kind) or {field.name for field in dataclasses.fields(kind)} != set(tree["fields"]):
         raise ValueError("it was written by another version of ltljax")
-    record: Any = object.__new__(kind)  # type: ignore
+    record: Any = object.__new__(kind)  # type: ignore (checked above to be a class)
     for key, part in tree["fields"].items():
         object.__setattr__(record, key, _made(part, arrays))
     return record

@@ -22,7 +22,7 @@ from .surface import FarFromOriginWarning, Surface
 
 _RESULTS = ("fit.json", "fitted.toml", "fit.png")
 _UNKNOWNS = "unknowns.npz"
-_WAYS = "Go on with it by --resume, begin anew by --overwrite, or name another --out."
+_WAYS = "Continue it with --resume, start over with --overwrite, or name another --out."
 
 
 def recover(
@@ -46,7 +46,7 @@ def recover(
         out: the folder to write to; made if absent.
         inputs: files that are read beside those the scenario names, and must not be replaced.
         resume: whether to begin with what an interrupted fit of the same data left there.
-        overwrite: whether to begin anew where a fit that has not converged left something.
+        overwrite: whether to start over although the folder holds a fit that has not converged.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.

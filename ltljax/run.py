@@ -33,7 +33,7 @@ from .surface import FarFromOriginWarning, Surface
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")
 _RESTART = "restart"
-_WAYS = "Go on with it by --resume, begin anew by --overwrite, or name another --out."
+_WAYS = "Continue it with --resume, start over with --overwrite, or name another --out."
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000
 # Bytes of a viewer's page from which on it is said.
@@ -77,7 +77,7 @@ def run(
         out: the folder to write to; made if absent.
         inputs: files that the run is made from, besides those the scenario names.
         resume: whether to go on from what ``out/restart`` holds of the same run.
-        overwrite: whether to begin anew where ``out/restart`` holds a run that has not ended.
+        overwrite: whether to start over although ``out/restart`` holds a run that has not ended.
 
     Returns:
         What ``summary.json`` holds.
@@ -118,6 +118,8 @@ def run(
             _advance(example, surface, times, reached, keeper)
         except SolveError as error:
             failure = error
+        except OSError as error:
+            raise _no_room(error, out) from error
         measured = _measure(example, surface, reached)
         measured["build_seconds"] = build_seconds
         for name, value in measured.items():
@@ -143,15 +145,20 @@ def run(
         try:
             _put(example, np.asarray(surface.normals), folder, reached, summary)
         except OSError as error:
-            raise OutputError(
-                f"The results could not be written: {error}. What was computed is kept in {out / _RESTART}: make room, "
-                "and give the same command with --resume."
-            ) from error
+            raise _no_room(error, out) from error
         keeper.remove()
     print(f"{'written to':32} {out}: {', '.join([*summary['files'], 'summary.json'])}")
     if failure is not None:
         raise failure
     return summary
+
+
+def _no_room(error: OSError, out: Path) -> OutputError:
+    """What to say of states or results that could not be written."""
+    return OutputError(
+        f"The results could not be written: {error}. What was computed is kept in {out / _RESTART}: make room, and "
+        "give the same command with --resume."
+    )
 
 
 def _result_names(example: Scenario, frames: int) -> list[str]:

@@ -25,7 +25,7 @@ from .conservation import stationary_measure
 from .construction import SurfaceReport, freeze, warn_of_coarse_mesh, warn_of_rows, with_reverse
 from .lifting.schemes import Geometry, Monotone, Scheme, Topology, weigh
 from .mesh import Mesh, far_middle
-from .mesh.arguments import as_numbers
+from .mesh.arguments import as_numbers, kind_of
 from .progress import Laps, watched
 from .records import read_record, write_record
 from .tables import AnyArray, difference_matrix, slot_sum
@@ -300,7 +300,7 @@ def on_surface(function: Callable[P, R]) -> Callable[P, R]:
         given = named.get("surface", arguments[place] if place < len(arguments) else None)
         if is_given and not isinstance(given, Surface):
             advice = " Build one: ltl.Surface.from_mesh(mesh)." if isinstance(given, Mesh) else ""
-            raise TypeError(f"{function.__name__} expected a Surface as surface, found {_kind(given)}.{advice}")
+            raise TypeError(f"{function.__name__} expected a Surface as surface, found {kind_of(given)}.{advice}")
         return function(*arguments, **named)
 
     return checked
@@ -328,7 +328,7 @@ def on_device(function: Callable) -> Callable:
                 as_numbers(f"the argument of {function.__name__}", value)
             is_no_array = name in are_arrays and (value is None or isinstance(value, str | tuple))
             if is_no_array or isinstance(value, list | dict | set) or inspect.isroutine(value):
-                raise TypeError(f"{function.__name__} expected an array as {name}, found {_kind(value)}.")
+                raise TypeError(f"{function.__name__} expected an array as {name}, found {kind_of(value)}.")
         return compiled(*arguments, **named)
 
     return on_surface(checked) if "surface" in names else checked
@@ -350,12 +350,6 @@ def _is_in_range(geometry: Geometry) -> bool:
     ]
     precision = np.finfo(geometry.vertices.dtype)
     return is_finite and all(size > precision.tiny / precision.eps for size in largest)
-
-
-def _kind(value: Any) -> str:
-    if value is None:
-        return "None"
-    return "a function" if inspect.isroutine(value) else f"a {type(value).__name__}"
 
 
 def _in_words(point: np.ndarray) -> str:

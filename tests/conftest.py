@@ -3,6 +3,7 @@
 With LTLJAX_CHECK_SHAPES=1 the annotated shapes are checked while the tests run, which takes about half as long again.
 """
 
+import functools
 import gc
 import os
 import tempfile
@@ -75,25 +76,20 @@ def as_users_call_it():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+def _path_in(folder: Path, name: str) -> Path:
+    """A file of the shared inputs; the test that asks for it is skipped where these are not at hand."""
+    if not (folder / name).exists():
+        pytest.skip(f"the file {name} is not at hand")
+    return folder / name
+
+
 @pytest.fixture
 def real_mesh():
-    """The path of a real mesh by name; tests that ask for it are skipped where the meshes are not at hand."""
-
-    def path(name: str) -> Path:
-        if not (MESHES / name).exists():
-            pytest.skip(f"the mesh {name} is not at hand")
-        return MESHES / name
-
-    return path
+    """The path of a real mesh by name."""
+    return functools.partial(_path_in, MESHES)
 
 
 @pytest.fixture
 def case_file():
-    """The path of a small input by name; tests that ask for it are skipped where these are not at hand."""
-
-    def path(name: str) -> Path:
-        if not (CASES / name).exists():
-            pytest.skip(f"the file {name} is not at hand")
-        return CASES / name
-
-    return path
+    """The path of a small input by name."""
+    return functools.partial(_path_in, CASES)

@@ -268,10 +268,10 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
         patched.setattr(sys.modules["ltljax.run"], "solve", interrupted)
         assert main(pieces) == 130
     assert (tmp_path / "pieces" / "restart" / "run.json").exists()
-    assert "Go on with the same command and --resume, or begin anew with --overwrite." in capsys.readouterr().err
+    assert "Go on with the same command and --resume, or start over with --overwrite." in capsys.readouterr().err
     code, error = fails(capsys, *pieces)
     assert code == 2
-    assert "holds a run that has not ended, at t = 0.8. Go on with it by --resume, begin anew by --overwrite" in error
+    assert "holds a run that has not ended, at t = 0.8. Continue it with --resume, start over with --overwrite" in error
     code, error = fails(capsys, *pieces, "--resume", "--seed", "5")
     assert code == 2
     assert "another scenario" in error

@@ -483,7 +483,7 @@ def test_a_fit_from_files_goes_on_where_it_was_left_and_no_other_does(seen, tmp_
     assert not left["converged"]
     capsys.readouterr()
     assert main(["fit", str(tmp_path / "on.toml"), *out]) == 2
-    assert "holds a fit that has not converged. Go on with it by --resume" in capsys.readouterr().err
+    assert "holds a fit that has not converged. Continue it with --resume" in capsys.readouterr().err
     assert main(["fit", str(tmp_path / "other.toml"), "--resume", *out]) == 2
     assert "holds another fit: its data differ" in capsys.readouterr().err
     # With another start, whose place what was kept takes.

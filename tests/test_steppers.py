@@ -147,7 +147,7 @@ def test_a_fixed_step_beyond_all_stages_is_taken_in_parts(sphere):
     parts = int(re.search(r"each step in (\d+) parts", found.method)[1])
     assert found.counts["num_steps"] == parts > 1
     assert np.abs(found.u_end).max() < 1e-3
-    with pytest.raises(ValueError, match="too long for RKL2, which is stable up to"):
+    with pytest.raises(ValueError, match=r"dt = 1e\+09 is too long: each step would be taken in \d+ parts"):
         end(1e5, 1e9)
     # Traced, where nothing can be raised, the state says so.
     assert not jnp.isfinite(jax.jit(lambda d: end(d).u_end)(1e5)).any()

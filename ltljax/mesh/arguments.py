@@ -7,6 +7,13 @@ from typing import Any
 import numpy as np
 
 
+def kind_of(value: Any) -> str:
+    """What a value is, for a message."""
+    if value is None:
+        return "None"
+    return "a function" if inspect.isroutine(value) else f"a {type(value).__name__}"
+
+
 def as_numbers(name: str, value: Any) -> Any:
     """The value, if as an array of real numbers it loses nothing.
 
@@ -15,8 +22,7 @@ def as_numbers(name: str, value: Any) -> Any:
         ValueError: it is a masked array, or one of dates, text, complex numbers or objects.
     """
     if isinstance(value, dict | set) or inspect.isroutine(value):
-        kind = "a function" if inspect.isroutine(value) else f"a {type(value).__name__}"
-        raise TypeError(f"Expected {name} as real numbers, found {kind}.")
+        raise TypeError(f"Expected {name} as real numbers, found {kind_of(value)}.")
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(
             f"Expected {name} as a plain array, found a masked one, whose mask would be lost. Fill it with "

@@ -37,7 +37,7 @@ class Read(NamedTuple):
 
 
 def read_meshio(path: Path) -> Read:
-    """VTK, VTU and Gmsh: their triangles, quadrangles and polygons; of curved elements the corners."""
+    """VTK, VTU and Gmsh: triangles, quadrangles and polygons. Curved elements are reduced to their corners."""
     import meshio
 
     grid = meshio.read(path)

@@ -25,7 +25,7 @@ def as_mesh(source: Any, *, repair: bool = False, weld: bool | float = True) -> 
 
     Args:
         source: the mesh.
-        repair: mend what can be mended, instead of raising; see `Mesh`.
+        repair: repair the mesh where possible instead of raising; see `Mesh`.
         weld: merge vertices at the same position, up to rounding; see `Mesh`.
 
     Raises:

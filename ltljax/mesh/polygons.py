@@ -70,7 +70,7 @@ def _needs_ears(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
         # A fan may also wind around its first corner more than once.
         along = (spokes[:, :-1] * spokes[:, 1:]).sum(axis=2)
         is_bad |= np.arctan2(np.linalg.norm(areas, axis=2), along).sum(axis=1) >= 2 * np.pi
-        # Of a polygon without an area, or without finite corners, the checks of the mesh know more.
+        # Polygons without an area or with infinite corners are left to the checks of the mesh, which name them.
         return is_bad & is_known & np.isfinite(square[:, 0]) & (square[:, 0] > 0)
 
 

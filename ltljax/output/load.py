@@ -14,7 +14,7 @@ from ..mesh import MeshError
 from ..mesh.columns import DataError, read_columns
 from ..mesh.readers import read_elsewhere
 
-# Of an archive, the arrays that are the mesh's own.
+# Arrays of an archive that belong to the mesh, not to the fields.
 _OF_THE_MESH = {"vertices", "faces"}
 _COLORS = {"red", "green", "blue", "alpha"}
 

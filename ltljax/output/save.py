@@ -36,9 +36,9 @@ class _Saved(NamedTuple):
         normals: (V, 3).
         uv: (F, 3, 2) places of the corners in an image, or None.
         fields: by name.
-        times: of a series, or None.
+        times: (T,) times of a series, or None.
         shades: (V, 4) of unsigned bytes, the colours of the first field of numbers.
-        colormap: of the shades.
+        colormap: name of the colour map of the shades.
     """
 
     vertices: np.ndarray
