@@ -85,7 +85,7 @@ def test_a_textured_mesh_opens_again_with_the_field_in_its_texture(tmp_path):
     u = np.sin(4 * mesh.vertices[:, 0])
     image = texture.bake(mesh.uv, mesh.faces, u, 512)
     assert np.isfinite(image).all()
-    flat = colors.vertex_colors(image.ravel(), (-1, 1), "gray")[:, :3].reshape(512, 512, 3)
+    flat = colors.vertex_colors(image.ravel(), (-1.0, 1.0), "gray")[:, :3].reshape(512, 512, 3)
     written = texture.write_textured_obj(tmp_path / "torus.obj", mesh.vertices, mesh.faces, mesh.uv, flat)
     assert [file.suffix for file in written] == [".obj", ".mtl", ".png"]
     opened = trimesh.load(tmp_path / "torus.obj", force="mesh", process=False)

@@ -184,7 +184,9 @@ def _open_nothing_but(path: Path, folders: Iterable[str]) -> None:
     sys.addaudithook(hook)
 
 
-def _reason(error: BaseException) -> str:
+def _reason(error: BaseException, package: str) -> str:
+    if isinstance(error, SystemExit):  # its number says nothing
+        return f"{package} gave up"
     if isinstance(error, MemoryError):
         return "MemoryError: it asks for far more memory than a file of its size should"
     return f"{type(error).__name__}: {error}".rstrip(": ")
@@ -209,7 +211,7 @@ def main(reader: str, path: Path, target: Path, memory: float, seconds: float) -
         # Readers of other projects meet damaged files with any exception there is, some even by leaving the program.
         # They mean the same: the file cannot be read.
         except (Exception, SystemExit) as error:
-            said["failed"] = _reason(error)
+            said["failed"] = _reason(error, PACKAGES[reader])
         json.dump(said, report)
 
 
