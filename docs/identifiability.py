@@ -69,6 +69,37 @@ def uniform_start():
     say("a uniform mixture", ltl.fit(experiment, GUESS, data, transforms=ltl.Positive()))
 
 
+def real_data():
+    """The first section's data as they come: wrong values, an unknown factor, gaps, a first guess far away."""
+    experiment, times = schnakenberg(), np.array([0.1, 0.25, 0.5])
+    clean, _ = noisy(experiment(TRUTH, times).us)
+    chance = np.random.default_rng(2)
+    wrong = np.where(chance.random(clean.shape) < 0.03, clean + 20, clean)
+    gaps = np.where(chance.random(clean.shape) < 0.3, np.nan, clean)
+    far = {key: 300 * value for key, value in TRUTH.items()}
+
+    def fitted(values, start=GUESS, **options):
+        return ltl.fit(experiment, start, ltl.Observations(values, times=times, **options), transforms=ltl.Positive())
+
+    cases = (
+        ("three values in a hundred off by 20, least squares", fitted(wrong)),
+        ('three values in a hundred off by 20, `loss="huber"`', fitted(wrong, loss="huber")),
+        ("times 3.7, factor not given", fitted(3.7 * clean)),
+        ("times 3.7, `scale=Positive(1.0)`", fitted(3.7 * clean, scale=ltl.Positive(1.0))),
+        ("a third missing", fitted(gaps)),
+        ("a guess 300 times too large", fitted(clean, far)),
+    )
+    print("| data | status | a | b | d | outliers named |\n" + "| --- " * 6 + "|")
+    for title, found in cases:
+        low, high = found.intervals
+        values = [f"{found.params[key]:.5g} ({low[key]:.5g} to {high[key]:.5g})" for key in TRUTH]
+        print(f"| {title} | {found.status} | {' | '.join(values)} | {len(found.agreement.outliers)} |")
+    for title, found in cases[:4]:
+        say(title, found)
+    figure = cases[1][1].plot()
+    figure.savefig("docs/real_data.png", dpi=90)
+
+
 def too_late():
     """The first guess makes another pattern, and no small change of rates turns its spots into those that were seen."""
     experiment, times = schnakenberg(), np.array([2.0])
@@ -142,7 +173,7 @@ def diffusivity_field():
 
 PARTS = dict(
     growing_pattern=growing_pattern, one_scale=one_scale, uniform_start=uniform_start, too_late=too_late,
-    faded=faded, diffusivity_field=diffusivity_field,
+    real_data=real_data, faded=faded, diffusivity_field=diffusivity_field,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -129,7 +129,10 @@ def _parser() -> argparse.ArgumentParser:
 
     new = commands.add_parser("new", help="print a scenario file to start from: ltljax new gray-scott > my.toml")
     new.set_defaults(command=_new)
-    new.add_argument("scenario", choices=scenario.library(), metavar="NAME", help="one of those of: ltljax list")
+    new.add_argument(
+        "scenario", choices=scenario.templates(), metavar="NAME",
+        help="one of those of: ltljax list; or fit, which finds rates from measurements",
+    )  # fmt: skip
 
     listing = commands.add_parser("list", help="the scenarios and built-in meshes")
     listing.set_defaults(command=_list)
@@ -231,7 +234,7 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
-    print(scenario.library()[options.scenario], end="")
+    print(scenario.templates()[options.scenario], end="")
     return 0
 
 

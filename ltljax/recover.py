@@ -3,6 +3,7 @@
 What enters: a `Scenario`. What leaves: a folder with a report, a picture, and the scenario with the numbers found.
 """
 
+import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
-from .fit import Experiment, Fit, Observations, Positive, fit
+from .fit import Agreement, Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
 from .folder import Folder
 from .lifting.schemes import Scheme
 from .progress import noted
-from .scenario import Scenario
+from .scenario import Scenario, ScenarioError, Wanted
 from .solve.restart import RestartError
 from .surface import FarFromOriginWarning, Surface
 
@@ -73,7 +74,10 @@ def recover(
             lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
             solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
         )  # fmt: skip
-        data = Observations(wanted.values, wanted.noise, wanted.times, wanted.vertices, wanted.species)
+        try:
+            data = _observations(wanted, surface)
+        except ValueError as error:
+            raise ScenarioError(f"{example.name}: fit.data: {error}") from None
         found = fit(
             experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
             checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),
@@ -81,18 +85,45 @@ def recover(
         print(found.summary())
         with folder.draft() as draft:
             files = _write(example, found, surface, draft)
-        if found.converged:
+        if found.has_settled:
             with restart.locked():
                 restart.remove_itself()
     print(f"written to {out}: {', '.join(files)}")
     return found
 
 
+def _observations(wanted: Wanted, surface: Surface) -> Observations:
+    """The data on the surface.
+
+    Raises:
+        ValueError: a point is far from the surface, a patch has no vertices, or the values do not suit the noise.
+    """
+    options = dict(wanted.options)
+    for key, unknown in (("scale", Positive(1.0)), ("offset", Real(0.0))):
+        if options.get(key) is True:
+            options[key] = unknown
+    places = wanted.places
+    if places.points is not None:
+        options["operator"] = observe_at(surface, places.points)
+    elif places.patches is not None:
+        options["operator"] = observe_patches(surface, places.patches)
+    else:
+        options["vertices"] = places.vertices
+    return Observations(wanted.values, times=wanted.times, species=wanted.species, **options)
+
+
+def _plain(agreement: Agreement) -> dict[str, Any]:
+    """The agreement of model and data as plain values."""
+    return dataclasses.asdict(agreement) | dict(outliers=agreement.outliers.tolist())
+
+
 def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[str]:
     numbers = {key: float(value) for key, value in found.params.items()}
     record: dict[str, Any] = dict(
         scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, runs=found.num_runs,
-        reason=found.reason, converged=found.converged, method=found.method,
+        reason=found.reason, status=found.status, converged=found.converged, method=found.method,
+        scanned=found.scanned, explanation=found.agreement.sentence(), agreement=_plain(found.agreement),
+        calibration={name: np.asarray(value).tolist() for name, value in found.calibration.items()},
     )  # fmt: skip
     if (known := found.evidence) is not None:
         low, high = known.intervals
@@ -100,10 +131,12 @@ def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[s
             std=dict(zip(known.names, known.std.tolist(), strict=True)),
             confidence=known.confidence,
             intervals={key: (float(low[key]), float(high[key])) for key in numbers},
+            ends=dict(zip(known.names, known.ends.T.tolist(), strict=True)),
             singular_values=known.singular_values.tolist(),
             noise=known.noise,
             cannot_tell=known.cannot_tell,
         )
+    record = json.loads(json.dumps(record), parse_constant=lambda _: None)  # NaN and infinity are no JSON
     (out / "fit.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     files = ["fit.json"]
     tables = json.loads(json.dumps(example.resolved))  # a copy of plain values
@@ -116,7 +149,7 @@ def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[s
     (out / "fitted.toml").write_text(head + text, encoding="utf-8")
     files.append("fitted.toml")
     try:
-        figure = found.plot(surface if np.ndim(found.residuals) == 3 else None)
+        figure = found.plot()
     except ImportError:
         print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
     else:

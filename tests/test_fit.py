@@ -589,7 +589,7 @@ def test_a_fit_stops_when_told_and_shows_its_progress(rates, capfd):
 
 
 BAD = {
-    "NaN": (lambda x: ltl.Observations(np.where(np.arange(len(x)) == 7, np.nan, 1.0)), r"nan at index \(7,\)"),
+    "infinity": (lambda x: ltl.Observations(np.where(np.arange(len(x)) == 7, np.inf, 1.0)), r"inf at index \(7,\)"),
     "noise": (lambda x: ltl.Observations(np.ones(3), 0.0), "positive noise"),
     "noise shape": (lambda x: ltl.Observations(np.ones(3), np.ones(2)), "does not fit values"),
     "noise of more": (lambda x: ltl.Observations(np.ones(3), np.ones((2, 3))), r"\(2, 3\) does not fit values \(3,\)"),
@@ -639,9 +639,9 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         ltl.Bounded(1.0, 1.0)
     with pytest.raises(ValueError, match="has but one"):
         ltl.fit(lambda p: p * bumpy(sphere), 1.0, ltl.Observations(bumpy(sphere), species=0))
-    with pytest.raises(ValueError, match=r"nan at index \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"inf at index \(0, 1\)"):
         ltl.fit_many(
-            lambda p: p * jnp.ones(3), 1.0, ltl.Observations(np.ones(3)), values=np.where(np.eye(2, 3, 1), np.nan, 1.0)
+            lambda p: p * jnp.ones(3), 1.0, ltl.Observations(np.ones(3)), values=np.where(np.eye(2, 3, 1), np.inf, 1.0)
         )
     # A model without an adjoint can be differentiated in reverse alone.
     reverse = lambda p: experiment(p, TIMES).us  # noqa: E731
@@ -777,5 +777,5 @@ def test_a_report_and_its_picture(rates, sphere):
         assert part in text
     np.testing.assert_allclose(found.prediction.us, values + level * found.residuals, atol=1e-8)
     figure = found.plot(sphere)
-    assert len(figure.axes) == 6
+    assert len(figure.axes) == 7
     plt.close(figure)

@@ -1,45 +1,30 @@
 """`fit`: a model, a first guess and data become parameters with error bars. The door to optimistix."""
 
 import dataclasses
-import io
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array
 
-from ..folder import Folder
 from ..progress import watched
-from ..solve.fingerprint import fingerprint
-from ..solve.restart import RestartError
-from .methods import MANY, SETTLED, Marquardt
-from .observations import Observations
-from .problem import Model, Problem, Residuals, jacobian_of, prepare, steps_adaptively
+from .agreement import Agreement, agreement
+from .checkpoint import Checkpoint
+from .methods import MANY
+from .observations import Experiment, Observations
+from .problem import Model, Problem, Program, Residuals, jacobian_of, prepare, steps_adaptively, values_of
 from .report import Evidence, evidence
 from .report import summary as _summary
-from .unknowns import Unknowns, unknowns
+from .scan import explains_nothing, scan
+from .search import End, FitError, search
+from .unknowns import unknowns
 
-# A step is the last that comes before a step of less than this share of the tolerance.
-_SETTLED_STEP = 0.1
-
-
-# Residuals that differ by less than this share, of themselves and of the data, are those of the same model.
-_SAME = 1e-4
-_ANEW = "Fit without resume, or give another checkpoint."
-
-
-# A least-squares fit that crawls ends when so many steps together lower twice the loss by less than this share of the
-# variance of the noise.
-_CRAWLING, _IMMATERIAL = 12, 1e-3
-
-
-class FitError(RuntimeError):
-    """A fit that could not begin: the model fails at the first guess."""
+# The spread of the misfit and the parameters agree when a round of the fit changes the spread by less than this share;
+# rounds at most.
+_AGREED, _ROUNDS = 0.01, 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,25 +33,66 @@ class Fit:
 
     Attributes:
         params: the parameters, as the start was given.
-        losses: (steps,) half the sum of squared residuals after every step, the start's first.
+        calibration: what was unknown about the measurement: scale, offset and amount of background, by name.
+        losses: (steps,) half the sum of squared residuals after every step, the start's first; where the spread of the
+            residuals is taken from the data, after every step with the last spread.
         reason: why it stopped, in words.
-        converged: whether it stopped because the parameters or the loss no longer changed, or no step lowers the loss.
+        has_settled: whether it stopped because the parameters or the loss no longer changed, or no step lowers the
+            loss.
         num_steps: of the method, rejected ones with them: each a run of the model, with derivatives in a least-squares
             method, and in others where it was accepted.
         method: the method, and how derivatives were taken.
-        residuals: (prediction - value) / noise, of every value.
+        residuals: (prediction - value) / noise of every value; NaN where nothing was measured.
         evidence: covariance, intervals, and what the data cannot tell; None with many unknowns.
+        agreement: whether the model explains the data: size and structure of the residuals, outliers.
+        scanned: what was done about a start that explains nothing, in words; empty where it explains something.
     """
 
     params: Any
+    calibration: dict[str, Array]
     losses: np.ndarray
     reason: str
-    converged: bool
+    has_settled: bool
     num_steps: int
     method: str
     residuals: np.ndarray
     evidence: Evidence | None
-    _problem: "Problem" = dataclasses.field(repr=False)
+    agreement: Agreement
+    scanned: str
+    _problem: Problem = dataclasses.field(repr=False)
+    _program: Program = dataclasses.field(repr=False)
+    _z: Array = dataclasses.field(repr=False)
+
+    @property
+    def status(self) -> str:
+        """What became of the fit, in one of these words or phrases:
+
+        - ``"converged"``: it has settled, the model explains the data, and they determine every parameter;
+        - ``"explains nothing"``: it has settled where the mean of the data would be as good a model;
+        - ``"end of range"``: it has settled with a parameter at the end of its range;
+        - ``"unexplained"``: it has settled, and the residuals are much larger than the noise;
+        - ``"structured residuals"``: it has settled, and the residuals are no noise: neighbours agree;
+        - ``"undetermined"``: it has settled in a flat valley, where the data do not determine every parameter;
+        - ``"stopped"``: it has not settled; ``reason`` says why.
+        """
+        if not self.has_settled:
+            return "stopped"
+        if self.agreement.is_useless:
+            return "explains nothing"
+        if self.evidence is not None and self.evidence.at_end.any():
+            return "end of range"
+        if self.agreement.is_unexplained:
+            return "unexplained"
+        if self.agreement.is_structured:
+            return "structured residuals"
+        if self.evidence is not None and self.evidence.cannot_tell:
+            return "undetermined"
+        return "converged"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit has settled at parameters that explain the data and are determined by them."""
+        return self.status == "converged"
 
     @property
     def num_runs(self) -> int:
@@ -104,8 +130,7 @@ class Fit:
     @property
     def prediction(self) -> Any:
         """What the model gives with the parameters found."""
-        problem = self._problem
-        return problem.residuals.predicted(problem.space.free(self.params))
+        return self._problem.residuals.predicted(self._z)
 
     def summary(self) -> str:
         """A table of the parameters with intervals, and in words how well the data tell them."""
@@ -115,14 +140,17 @@ class Fit:
         return self.summary()
 
     def plot(self, surface: Any = None) -> Any:
-        """The loss, the data against the model, and the confidence regions of pairs, as a matplotlib figure.
+        """Data, model and residuals on the surface, outliers marked; the loss, intervals and regions of pairs, as a
+        matplotlib figure.
 
         Args:
-            surface: where data of whole states are shown on; none for points alone.
+            surface: surface to draw on; by default that of the `Experiment`.
         """
         from .picture import picture
 
-        return picture(self, self.data, surface)
+        model = self._problem.residuals.model
+        known = model.surface if isinstance(model, Experiment) else None
+        return picture(self, self.data, known if surface is None else surface)
 
     def profile(self, name: str, values: Any, max_steps: int = 30) -> np.ndarray:
         """The least loss with one parameter held at each of some values: its profile likelihood.
@@ -141,7 +169,7 @@ class Fit:
         Raises:
             ValueError: there is no such parameter, or a value is outside its range.
         """
-        return self._problem.profile(self.params, name, np.asarray(values, np.float64), max_steps)
+        return self._problem.profile(self._program, self._z, name, np.asarray(values, np.float64), max_steps)
 
 
 def fit(
@@ -198,180 +226,106 @@ def fit(
         OutputError: ``checkpoint`` names a file that ltljax did not write.
         FitError: the model fails at the start.
     """
-    space = unknowns(start, transforms)
-    z, left = space.free(start), None
-    keeper = None if checkpoint is None else _Checkpoint(Path(checkpoint), space, data)
+    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64)[np.asarray(data.mask)] ** 2))) or 1.0
+    calibration = data.calibration.unknowns(typical)
+    space = unknowns(start, transforms, calibration)
+    z = space.free((start, {name: guess for name, (guess, *_) in calibration.items()}))
+    left = spread = None
+    keeper = None if checkpoint is None else Checkpoint(Path(checkpoint), space, data)
     if keeper is not None and resume and keeper.path.exists():
-        space, z, left = keeper.read()
+        space, z, left, spread = keeper.read()
     if keeper is not None:
         keeper.folder.check([keeper.path.name])
     problem = prepare(model, space, data, penalty, method, z, rtol, atol)
-    converted = problem.converted(z)
-    function = problem.function(converted, z)
-    # Of infinite derivatives it is zero.
-    if not 0 < float(function.scale) < np.inf and bool(jnp.isfinite(eqx.filter_jit(converted)(z)).all()):
+    residuals = problem.program if spread is None else problem.program.with_spread(jnp.asarray(spread, z.dtype))
+    function, (value, misfit) = problem.function(residuals, z)
+    scanned = ""
+    if left is None and explains_nothing(problem.residuals, np.asarray(misfit)):
+        z, scanned = _scanned(problem.residuals, z)
+        function, (value, misfit) = problem.function(residuals, z)
+    # Infinite derivatives make the factor zero.
+    if not 0 < float(function.scale) < np.inf and bool(jnp.isfinite(value).all()):
         raise FitError(
             "The model has no finite derivatives at the start, though its prediction is finite. Look for a square "
             "root, a norm or a power of zero there, or begin elsewhere."
         )
-    # Half the variance of the noise, in the loss's unit.
-    unit, size = 0.0 if data.noise is None else 0.5, data.values.size
-    options: dict[str, Any] = {}
-    y, state, best = z, _begin(problem.solver, function, z, options), z
-    losses: list[float] = []
-    reason, converged = f"the {max_steps} steps allowed were taken", False
-    bar = watched("fit", unit="step")(range(max_steps)) if progress else range(max_steps)
-    for step in bar:
-        y, state, seen = _step(problem.solver, function, y, options, state)
-        loss = float(seen.loss / function.scale**2)
-        if not np.isfinite(loss):
-            if step == 0:
-                raise FitError(
-                    "The model fails at the start: its prediction is not finite, or the run did not reach its end. Run "
-                    "it there by itself (ltl.solve says why), and begin elsewhere."
-                )
-            reason = "the model fails where the optimiser went, which cannot go back: take a lower rate"
-            break
-        best = seen.z
-        losses.append(loss)
-        if hasattr(bar, "set_postfix_str"):
-            bar.set_postfix_str(f"loss {loss:.4g}")  # type: ignore
+    if spread is None and data.has_moving_spread:
+        residuals, _ = _respread(data, residuals, misfit)
+        function = dataclasses.replace(function, residuals=residuals)
+
+    def after(step: int, loss: float, z: Array) -> bool:
         if keeper is not None:
-            if step == 0 and left is not None:
+            if step == 0 and left is not None and not num_steps:
                 keeper.refuse_other(loss, left)
-            keeper.keep(best, loss)
-        if bool(seen.done):
-            reason, converged = "parameters or loss no longer change", True
+            keeper.keep(z, loss, np.asarray(residuals.arrays.spread))
+        return stop_when is not None and bool(stop_when(num_steps + step, loss, space.params(z)))
+
+    def unit(loss: float) -> float:
+        return max(0.0 if data.noise is None else 0.5, loss / data.num_values)
+
+    num_steps, end = 0, End(z, [], "", False)
+    for _ in range(_ROUNDS):
+        steps = range(max_steps - num_steps)
+        steps = watched("fit", unit="step")(steps) if progress else steps
+        end = search(problem.solver, function, z, steps, unit, after)
+        z, num_steps = end.z, num_steps + len(end.losses)
+        if not (data.has_moving_spread and end.has_settled and num_steps < max_steps):
             break
-        rejected, failed = int(seen.rejected), int(seen.failed)
-        if failed and rejected >= seen.most:
-            reason = f"the model fails at every step from here, {failed} ever shorter ones: begin elsewhere"
+        residuals, change = _respread(data, residuals, values_of(residuals, z)[1])
+        if change < _AGREED:
             break
-        if rejected >= seen.most:
-            reason, converged = "no step lowers the loss any further", True
-            break
-        if (
-            isinstance(problem.solver, Marquardt)
-            and not rejected
-            and len(losses) > _CRAWLING
-            and losses[-1 - _CRAWLING] - loss <= _IMMATERIAL * max(unit, loss / size)
-        ):
-            reason, converged = "the loss no longer changes", True
-            break
-        if stop_when is not None and stop_when(step, loss, space.params(best)):
-            reason = "stop_when held"
-            break
-    return _found(problem, converted, best, losses, reason, converged, confidence)
+        function = dataclasses.replace(function, residuals=residuals)
+    return _found(problem, residuals, end, num_steps, scanned, confidence)
 
 
-class _Seen(eqx.Module):
-    """A step as `fit` sees it: where the loss is known, the loss, and how the search goes."""
-
-    z: Array
-    loss: Array
-    done: Array
-    rejected: Array
-    failed: Array
-    most: int = eqx.field(static=True)
+def _respread(data: Observations, residuals: Program, misfit: Array) -> tuple[Program, float]:
+    """The residuals with the spread that the misfit shows, and by what share it differs from the one before."""
+    before = np.asarray(residuals.arrays.spread, np.float64)
+    spread = data.spread(np.asarray(misfit), before)
+    change = float(np.max(np.abs(np.log(spread / before))))
+    return residuals.with_spread(jnp.asarray(spread, residuals.arrays.spread.dtype)), change
 
 
-@eqx.filter_jit
-def _begin(solver, function, z, options):
-    struct, aux = eqx.filter_eval_shape(function, z, None)
-    return solver.init(function, z, None, options, struct, aux, frozenset())
-
-
-@eqx.filter_jit
-def _step(solver: Any, function: Any, z: Array, options: dict[str, Any], state: Any) -> tuple[Array, Any, _Seen]:
-    if isinstance(solver, optx.OptaxMinimiser):
-        # Its loss is that of the point the step began at.
-        further, state, _ = solver.step(function, z, None, options, state, frozenset())
-        none = jnp.array(0)
-        return further, state, _Seen(z, state.f, state.terminate, none, none, 1)
-    before = state.f_info.as_min()
-    further, state, _ = solver.step(function, z, None, options, state, frozenset())
-    done, _ = solver.terminate(function, z, None, options, state, frozenset())
-    loss, trials, most = state.f_info.as_min(), state.search_state, solver.search.most
-    if not isinstance(solver, Marquardt):
-        # In a minimum the loss's rounding may keep the solver from seeing that its steps lead nowhere.
-        is_short = jnp.abs(state.y_eval - further) <= _SETTLED_STEP * (solver.rtol * jnp.abs(further) + solver.atol)
-        done |= jnp.all(is_short) & (trials.failed == 0)
-        done |= (loss < before) & (before - loss <= SETTLED * loss)
-    return further, state, _Seen(further, loss, done, trials.rejected, trials.failed, most)
+def _scanned(residuals: Any, z: Array) -> tuple[Array, str]:
+    """A better start than the first guess, and what was done to find it, in words."""
+    found = scan(residuals, np.asarray(z))
+    if found is None:
+        return z, "The start explains nothing, and no point within a factor of 1000 of it that was tried explains more."
+    better, count = found
+    z = jnp.asarray(better, z.dtype)
+    values = jax.tree.leaves(residuals.space.params(z))
+    flat = np.concatenate([np.ravel(np.asarray(leaf)) for leaf in values])
+    words = ", ".join(f"{name} = {value:.3g}" for name, value in zip(residuals.space.names, flat, strict=False))
+    return z, f"The start explains nothing, so the fit began at the best of {count} points around it: {words}."
 
 
 def _found(
-    problem: Problem, converted: Any, z: Array, losses: list[float], reason: str, converged: bool, confidence: float
-) -> Fit:
-    num_values = problem.data.values.size
-    space = problem.space
-    known = None
+    problem: Problem, residuals: Program, end: End, num_steps: int, scanned: str, confidence: float
+) -> Fit:  # fmt: skip
+    data, space, z = problem.data, problem.space, end.z
+    spread = np.asarray(residuals.arrays.spread, np.float64)
+    known, free = None, float(data.num_values)
+    reason, has_settled = end.reason, end.has_settled
     if z.size <= MANY and problem.is_least_squares:
-        value, jacobian = jacobian_of(converted, z, problem.reverse)
+        (value, misfit), jacobian = jacobian_of(residuals, z, problem.reverse)
         if bool(jnp.isfinite(jacobian).all()):
             adaptive = steps_adaptively(problem.residuals.model)
-            known = evidence(space, z, problem.data, value, jacobian, confidence, adaptive)
+            known = evidence(space, z, data, value, misfit, jacobian, spread, confidence, adaptive)
+            free = known.degrees_of_freedom
         else:
-            reason, converged = f"{reason}; derivatives are not finite there, so that nothing is known of errors", False
+            reason += "; derivatives are not finite there, so that nothing is known of errors"
+            has_settled = False
     else:
-        value = eqx.filter_jit(converted)(z)
-    residuals = np.asarray(value[:num_values]).reshape(problem.data.values.shape)
+        _, misfit = values_of(residuals, z)
+    shape = data.values.shape
+    # Where the noise was not given, residuals are in the unit of the data.
+    factor = spread if data.estimates_spread else 1.0
+    misfit = np.where(np.asarray(data.mask), np.asarray(misfit, np.float64).reshape(shape) * factor, np.nan)
+    model = problem.residuals.model
+    surface = model.surface if isinstance(model, Experiment) and model.vertices is None else None
+    agreed = agreement(data, misfit, free, surface)
+    params, calibration = space.values(z)
     return Fit(
-        space.params(z), np.array(losses), reason, converged, len(losses), problem.method, residuals, known, problem
-    )
-
-
-class _Checkpoint:
-    """The unknowns on disk, whole or not at all, and what a fit must be to go on from them.
-
-    Args:
-        path: the file.
-        space: the unknowns.
-        data: what is fitted.
-    """
-
-    def __init__(self, path: Path, space: Unknowns, data: Observations):
-        self.path, self.space, self.data = path, space, data
-        self.folder = Folder(path.parent)
-        self.fit = {"data": fingerprint(data), "ranges of parameters": fingerprint(space.transforms)}
-
-    def keep(self, z: Array, loss: float) -> None:
-        """Write a step."""
-        scales = np.array([float(scale) for scale in self.space.scales])
-        content = io.BytesIO()
-        np.savez(
-            content, unknowns=np.asarray(z), names=np.array(self.space.names), scales=scales, loss=loss,
-            fit=np.array(list(self.fit.values())),
-        )  # fmt: skip
-        with self.folder.locked(waits=True):
-            self.folder.write(self.path.name, content.getvalue())
-
-    def read(self) -> tuple[Unknowns, Array, float]:
-        """The unknowns with the scales they were left with, their vector, and the loss there."""
-        try:
-            with np.load(self.path, allow_pickle=False) as file:
-                kept = {name: file[name] for name in ("unknowns", "names", "scales", "loss", "fit")}
-        except (ValueError, KeyError, OSError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile):
-            raise RestartError(f"{self.path} is damaged, or no file of a fit. {_ANEW}") from None
-        if tuple(kept["names"]) != self.space.names:
-            raise RestartError(
-                f"{self.path} holds the parameters of another fit: {', '.join(kept['names'][:8])}; expected "
-                f"{', '.join(self.space.names[:8])}. {_ANEW}"
-            )
-        for (what, mine), theirs in zip(self.fit.items(), kept["fit"], strict=True):
-            if mine != theirs:
-                raise RestartError(f"{self.path} holds another fit: its {what} differ. {_ANEW}")
-        scales = tuple(jnp.asarray(k, s.dtype) for k, s in zip(kept["scales"], self.space.scales, strict=True))
-        space = dataclasses.replace(self.space, scales=scales)
-        self.space = space
-        return space, jnp.asarray(kept["unknowns"], scales[0].dtype), float(kept["loss"])
-
-    def refuse_other(self, loss: float, left: float) -> None:
-        """Raise where the model gives another loss than the one that was left."""
-        here, there = np.sqrt(2 * loss), np.sqrt(2 * left)
-        noise = 1.0 if self.data.noise is None else np.asarray(self.data.noise)
-        size = np.linalg.norm(np.asarray(self.data.values) / noise)
-        if not abs(here - there) <= _SAME * (there + size):
-            raise RestartError(
-                f"{self.path} holds another fit: its loss was {left:.6g} where this model's is {loss:.6g}. {_ANEW}"
-            )
+        params, calibration, np.array(end.losses), reason, has_settled, num_steps, problem.method, misfit, known,
+        agreed, scanned, problem, residuals, z,
+    )  # fmt: skip

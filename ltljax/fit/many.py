@@ -1,6 +1,5 @@
 """Many fits at once, from many starts or to many data sets; and where to start when a loss has many valleys."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .observations import Observations, refuse_non_finite
+from .observations import Observations, refuse_infinite
 from .problem import FitResiduals, Model, Residuals, forward_adjoint, prepare
 from .unknowns import unknowns
 
@@ -24,12 +23,14 @@ class ManyFits(eqx.Module):
         losses: (N,) of each; infinite where the model fails at the start.
         num_steps: (N,).
         converged: (N,).
+        calibration: unknown scale, offset and background of the data, by name, with the fits along a new first axis.
     """
 
     params: Any
     losses: Float[Array, " N"]
     num_steps: Array
     converged: Bool[Array, " N"]
+    calibration: dict[str, Array]
 
     @property
     def best(self) -> Any:
@@ -70,8 +71,16 @@ def fit_many(
     many = None if values is None else jnp.asarray(values, data.values.dtype)
     if many is not None and many.shape[1:] != data.values.shape:
         raise ValueError(f"Expected values of shape (N, *{data.values.shape}), found {many.shape}.")
+    if data.has_moving_spread:
+        raise ValueError(
+            "fit_many takes the noise as given: give Observations(..., noise=...) beside a robust loss, and no "
+            "relative_noise; or call ltl.fit for each."
+        )
+    measured = None
     if many is not None:
-        refuse_non_finite(np.asarray(many))
+        refuse_infinite(np.asarray(many))
+        measured = ~jnp.isnan(many) & data.mask[None]
+        many = jnp.where(measured, many, 0)
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(starts)]
     shapes = {leaf.shape[:1] for leaf in leaves}
     if values is None and (len(shapes) != 1 or shapes == {()}):
@@ -81,28 +90,31 @@ def fit_many(
     each = (
         [starts] if rows is None else [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], starts) for k in range(rows)]
     )
-    space, *_ = [unknowns(start, transforms) for start in each]
-    z = jnp.stack([space.free(start) for start in each])
+    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64) ** 2))) or 1.0
+    calibration = data.calibration.unknowns(typical)
+    guesses = {name: guess for name, (guess, *_) in calibration.items()}
+    space, *_ = [unknowns(start, transforms, calibration) for start in each]
+    z = jnp.stack([space.free((start, guesses)) for start in each])
     problem = prepare(model, space, data, penalty, method, z[0], rtol, atol)
 
     def one(z, values):
-        residuals = problem.residuals
+        residuals = problem.program
         if values is not None:
-            residuals = eqx.tree_at(lambda r: r.data.values, residuals, values)
-        converted = dataclasses.replace(problem, residuals=residuals).converted(z)
-        function = problem.function(converted, z)
+            residuals = eqx.tree_at(lambda r: (r.arrays.data.values, r.arrays.data.mask), residuals, values)
+        function, _ = problem.function(residuals, z)
         call = optx.least_squares if problem.is_least_squares else optx.minimise
         out = call(function, problem.solver, z, has_aux=True, throw=False, max_steps=max_steps)
-        loss = 0.5 * jnp.sum(converted(out.value) ** 2)
+        loss = 0.5 * jnp.sum(residuals(out.value) ** 2)
         converged = (out.result == optx.RESULTS.successful) & jnp.isfinite(loss)
-        return space.params(out.value), loss, out.stats["num_steps"], converged
+        params, calibration = space.values(out.value)
+        return params, loss, out.stats["num_steps"], converged, calibration
 
     def whole(given):
         return one(given, None) if many is None else one(z[0], given)
 
-    along = z if many is None else many
+    along = z if many is None else (many, measured)
     # With the arrays it reads as leaves: as constants of the program they would be folded, slowly.
-    converted = eqx.filter_closure_convert(whole, along[0])
+    converted = eqx.filter_closure_convert(whole, jax.tree.map(lambda leaf: leaf[0], along))
     arrays, rest = eqx.partition(converted, eqx.is_array)
     mapped = jax.jit(
         jax.vmap(lambda arrays, one: eqx.combine(arrays, rest)(one), in_axes=(None, 0)), compiler_options=_options()
@@ -167,9 +179,13 @@ def explore(
     in_log = (least > 0) & logarithmic
     safe = np.where(in_log, least, 1.0), np.where(in_log, most, 1.0)
     points = np.where(in_log, safe[0] * (safe[1] / safe[0]) ** share, least + (most - least) * share)
-    space = unknowns(rebuild(jnp.asarray(points[0])))
-    residuals = FitResiduals(model, data, space, None, forward_adjoint(model))
-    free = jax.vmap(lambda point: space.free(rebuild(point)))
+    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64) ** 2))) or 1.0
+    calibration = data.calibration.unknowns(typical)
+    guesses = {name: jnp.asarray(guess) for name, (guess, *_) in calibration.items()}
+    space = unknowns(rebuild(jnp.asarray(points[0])), None, calibration)
+    spread = jnp.ones(data.spread_shape, jnp.result_type(float))
+    residuals = FitResiduals(model, data, space, None, forward_adjoint(model), spread)
+    free = jax.vmap(lambda point: space.free((rebuild(point), guesses)))
     z = np.asarray(free(jnp.asarray(points, jnp.result_type(float))))
     data.check(eqx.filter_eval_shape(lambda z: residuals.predicted(z), z[0]))
     converted = eqx.filter_closure_convert(lambda z: residuals(z), jnp.asarray(z[0]))

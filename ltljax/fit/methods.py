@@ -65,7 +65,19 @@ class Marquardt(optx.LevenbergMarquardt):
     second: steps become short far from the minimum. So this asks the step of Gauss and Newton. Where steps are short,
     or lead nowhere, the minimum is reached if that is short too, or is to lower the loss by no more than `SETTLED`; if
     not damping falls. Elsewhere it is reached if both hold.
+
+    No step changes an unknown by more than ``reach``. A run far from all parameters that make sense may take thousands
+    of times as long as any other, only for its step to be rejected.
+
+    Attributes:
+        reach: (n,) largest change of each unknown in one step; None for any.
     """
+
+    reach: Array | None
+
+    def __init__(self, rtol, atol, norm, linear_solver, verbose, reach=None):
+        super().__init__(rtol, atol, norm, linear_solver, verbose)
+        self.reach = reach
 
     def step(self, fn, y, args, options, state, tags):
         """As of optimistix, with another end."""
@@ -83,11 +95,13 @@ class Marquardt(optx.LevenbergMarquardt):
         is_there = jnp.where(is_held, is_close | is_level, is_close & is_level) | (is_short & (size >= largest))
         freer = jnp.where(is_short & ~is_there, jnp.minimum(_UNDAMPED * size, largest), size)
         ahead, _ = self.descent.step(freer, state.descent_state)
+        if self.reach is not None:
+            ahead = jnp.clip(ahead, -self.reach, self.reach)
         where = lambda s: (s.terminate, s.y_eval, s.search_state.inner.step_size)  # noqa: E731
         return y, eqx.tree_at(where, state, (is_there, y + ahead, freer)), aux
 
 
-def method_of(method: Any, size: int, rtol: float, atol: float) -> tuple[Any, str]:
+def method_of(method: Any, size: int, rtol: float, atol: float, reach: Array | None = None) -> tuple[Any, str]:
     """The solver that a user's method becomes, and its name.
 
     Args:
@@ -95,16 +109,17 @@ def method_of(method: Any, size: int, rtol: float, atol: float) -> tuple[Any, st
         size: the number of unknowns.
         rtol: of the solver where the user names none.
         atol: as ``rtol``.
+        reach: (size,) largest change of each unknown in one step of Levenberg and Marquardt's method.
 
     Raises:
         ValueError: it is no method, or one without a search.
     """
     if method is None and size <= MANY:
-        return _prepared(optx.LevenbergMarquardt(rtol, atol)), "Levenberg-Marquardt"
+        return _prepared(optx.LevenbergMarquardt(rtol, atol), reach), "Levenberg-Marquardt"
     if method is None:
         return _prepared(optx.LBFGS(rtol, atol, history_length=20)), "L-BFGS"
     if isinstance(method, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser) and hasattr(method, "search"):
-        return _prepared(method), type(method).__name__
+        return _prepared(method, reach), type(method).__name__
     if hasattr(method, "init") and hasattr(method, "update"):
         return optx.OptaxMinimiser(method, rtol, atol), "optax"
     raise ValueError(
@@ -113,11 +128,11 @@ def method_of(method: Any, size: int, rtol: float, atol: float) -> tuple[Any, st
     )
 
 
-def _prepared(method: Any) -> Any:
+def _prepared(method: Any, reach: Array | None = None) -> Any:
     """A method whose steps are counted and can be taken back."""
     if type(method) is optx.LevenbergMarquardt:
         kept = method
-        method = Marquardt(kept.rtol, kept.atol, kept.norm, kept.descent.linear_solver, kept.verbose)  # type: ignore
+        method = Marquardt(kept.rtol, kept.atol, kept.norm, kept.descent.linear_solver, kept.verbose, reach)  # type: ignore
         method = eqx.tree_at(lambda m: m.search, method, kept.search)
     if isinstance(method.search, optx.LearningRate):
         # Whole steps where they lower the loss, shorter ones where not.

@@ -95,19 +95,19 @@ def choose_weight(
     curve, fits, start = [], [], None
     for weight in sorted(weights, reverse=True):
         found = fit_with(weight, start)
-        if rule == "discrepancy" and found.data.noise is None:
+        if rule == "discrepancy" and not found.data.knows_noise:
             raise ValueError("The discrepancy principle needs the noise: give Observations(..., noise=...).")
         start = found.params
-        misfit = float(np.sum(found.residuals**2))
+        misfit = float(np.nansum(found.residuals**2))
         fits.append(found)
         curve.append((weight, misfit, max(2 * found.loss - misfit, 0.0)))
-        if rule == "discrepancy" and misfit <= found.residuals.size:
+        if rule == "discrepancy" and misfit <= found.data.num_values:
             break
     table = np.array(curve)
-    if rule == "discrepancy" and table[-1, 1] > fits[-1].residuals.size:
+    if rule == "discrepancy" and table[-1, 1] > fits[-1].data.num_values:
         warnings.warn(
             f"No weight down to {table[-1, 0]:g} explains the data: the misfit is {table[-1, 1]:.4g}, of noise "
-            f"{fits[-1].residuals.size}. Try smaller weights or more max_steps, or doubt the model or the noise.",
+            f"{fits[-1].data.num_values}. Try smaller weights or more max_steps, or doubt the model or the noise.",
             stacklevel=2,
         )
     if rule == "discrepancy" or len(table) < 3:

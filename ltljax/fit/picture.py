@@ -1,5 +1,6 @@
-"""What a fit looks like: the loss, the data against the model, and which parameters are known together."""
+"""What a fit looks like: data, model and residuals, the loss, intervals, and what is known of parameters together."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -10,39 +11,69 @@ from .observations import Observations
 _PAIRS = 3
 # Points drawn at most of data against model.
 _POINTS = 4000
+# Intervals drawn at most, and the largest end that is drawn, as a multiple of the value.
+_INTERVALS, _WIDEST = 12, 3.0
 
 
-def picture(fit: Any, data: Observations, surface: Any = None) -> Any:
-    """A matplotlib figure of a `Fit`."""
+def picture(fit: Any, data: Observations, surface: Any = None, observed: np.ndarray | None = None) -> Any:
+    """A matplotlib figure of a `Fit`: data, model and residuals on the surface, with outliers marked; the loss, data
+    against model, intervals, and the regions of the parameters that are known together.
+
+    Args:
+        fit: the fit.
+        data: what was fitted.
+        surface: surface to draw on; None for none.
+        observed: what the model predicts for the data, in their shape.
+    """
     import matplotlib.pyplot as plt
 
     known = fit.evidence
     pairs = [] if known is None else _strongest(known.covariance)
-    shown = surface is not None and data.values.size and fit.residuals.shape != ()
-    count = 2 + len(pairs)
-    figure = plt.figure(figsize=(3.6 * max(count, 2), 7.0 if shown else 3.4), layout="constrained")
-    grid = figure.add_gridspec(2 if shown else 1, count)
+    axis = 0 if data.times is None else 1
+    has_places = surface is not None and data.values.ndim > axis and data.values.shape[axis] > 1
+    count = 2 + (known is not None) + len(pairs)
+    figure = plt.figure(figsize=(3.6 * max(count, 2), 7.2 if has_places else 3.6), layout="constrained")
+    figure.suptitle(textwrap.fill(fit.agreement.sentence(), 36 * max(count, 2)), fontsize="medium")
+    grid = figure.add_gridspec(2 if has_places else 1, count)
     axes = figure.add_subplot(grid[0, 0])
     axes.semilogy(np.maximum(fit.losses, 1e-300), marker=".")
     axes.set(xlabel="step", ylabel="loss", title="loss")
-    _against(figure.add_subplot(grid[0, 1]), fit, data)
+    predicted = np.asarray(data.of(fit.prediction, fit.calibration) if observed is None else observed)
+    _against(figure.add_subplot(grid[0, 1]), fit, data, predicted)
+    if known is not None:
+        _intervals(figure.add_subplot(grid[0, 2]), known)
     for k, pair in enumerate(pairs):
-        _ellipse(figure.add_subplot(grid[0, 2 + k]), known, pair)
-    if shown:
-        _on_surface(figure.add_subplot(grid[1, :]), fit, data, surface)
+        _ellipse(figure.add_subplot(grid[0, 3 + k]), known, pair)
+    if has_places:
+        _on_surface(figure.add_subplot(grid[1, :]), fit, data, predicted, surface)
     return figure
 
 
-def _against(axes: Any, fit: Any, data: Observations) -> None:
-    noise = 1.0 if data.noise is None else np.asarray(data.noise)
-    seen = np.asarray(data.values)
-    predicted = (seen + fit.residuals * noise).ravel()
-    seen = seen.ravel()
+def _against(axes: Any, fit: Any, data: Observations, predicted: np.ndarray) -> None:
+    mask = np.asarray(data.mask)
+    seen, model = np.asarray(data.values)[mask], predicted[mask]
     some = np.linspace(0, seen.size - 1, min(seen.size, _POINTS)).astype(int)
-    ends = [min(seen.min(), predicted.min()), max(seen.max(), predicted.max())]
+    ends = [min(seen.min(), model.min()), max(seen.max(), model.max())]
     axes.plot(ends, ends, color="gray", linewidth=0.8)
-    axes.plot(seen[some], predicted[some], ".", markersize=2)
+    axes.plot(seen[some], model[some], ".", markersize=2)
+    if len(fit.agreement.outliers):
+        far = tuple(fit.agreement.outliers.T)
+        axes.plot(np.asarray(data.values)[far], predicted[far], "x", color="crimson", label="outliers")
+        axes.legend()
     axes.set(xlabel="observed", ylabel="model", title="data against model")
+
+
+def _intervals(axes: Any, known: Any) -> None:
+    """The interval of each parameter, relative to its value."""
+    names, values, ends = known.names[:_INTERVALS], known.values[:_INTERVALS], known.ends[:, :_INTERVALS]
+    sizes = np.where(values == 0, 1.0, np.abs(values))
+    places = np.arange(len(names))
+    low, high = (np.clip((end - values) / sizes, -1, _WIDEST) for end in ends)
+    axes.errorbar(100 * 0.5 * (low + high), places, xerr=100 * 0.5 * (high - low), fmt="none", capsize=4)
+    axes.plot(np.zeros(len(names)), places, "|", color="black")
+    labels = [f"{name} = {value:.4g}" for name, value in zip(names, values, strict=True)]
+    axes.set_yticks(places, labels)
+    axes.set(xlabel="% of the value", title=f"{100 * known.confidence:.0f} % intervals")
 
 
 def _strongest(covariance: np.ndarray) -> list[tuple[int, int]]:
@@ -73,24 +104,35 @@ def _ellipse(axes: Any, known: Any, pair: tuple[int, int]) -> None:
     axes.set(xlabel=known.names[i], ylabel=known.names[j], title=f"{100 * known.confidence:.0f} % region")
 
 
-def _on_surface(axes: Any, fit: Any, data: Observations, surface: Any) -> None:
-    """Data, model and what remains, on the surface, of the last time and the first species."""
+def _on_surface(axes: Any, fit: Any, data: Observations, predicted: np.ndarray, surface: Any) -> None:
+    """Data, model and what remains on the surface, of the first species and of the time with the most outliers."""
     from ..output import pictures
 
-    noise = 1.0 if data.noise is None else np.broadcast_to(np.asarray(data.noise), fit.residuals.shape)
-    seen, rest = np.asarray(data.values), fit.residuals * noise
+    far = fit.agreement.outliers
+    when = -1
+    if data.times is not None and len(far):
+        when = int(np.argmax(np.bincount(far[:, 0], minlength=len(data.times))))
+    mask, seen = np.asarray(data.mask), np.asarray(data.values, np.float64)
+    is_far = np.zeros(seen.shape, bool)
+    is_far[tuple(far.T)] = True
+    fields = [np.where(mask, seen, np.nan), np.asarray(predicted, np.float64), is_far]
     if data.times is not None:
-        seen, rest = seen[-1], rest[-1]
-    if seen.ndim == 2:
-        seen, rest = seen[:, 0], rest[:, 0]
-    where = np.arange(surface.num_vertices) if data.vertices is None else data.vertices
+        fields = [field[when] for field in fields]
+    observed, model, is_far = (field[:, 0] if field.ndim == 2 else field for field in fields)
     vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
+    where = np.arange(len(vertices)) if data.vertices is None else data.vertices
+    if data.sampling is not None:
+        # Each measurement is drawn at the vertex that weighs most in it.
+        heaviest = np.argmax(np.abs(np.asarray(data.sampling.weights)), axis=1)
+        where = data.sampling.vertices[np.arange(len(heaviest)), heaviest]
+    good = np.isfinite(observed) & ~is_far
+    ends = (float(observed[good].min()), float(observed[good].max())) if good.any() else (0.0, 1.0)
+    rest = model - observed
+    size = float(np.abs(rest[good]).max(initial=0.0)) or 1.0
     rows = []
-    ends = float(seen.min()), float(seen.max())
-    far = float(np.abs(rest).max()) or 1.0
     for title, values, limits, colors in (
-        ("observed", seen, ends, "viridis"), ("model", seen + rest, ends, "viridis"),
-        ("model - observed", rest, (-far, far), "coolwarm"),
+        ("observed", observed, ends, "viridis"), ("model", model, ends, "viridis"),
+        ("model - observed", rest, (-size, size), "coolwarm"),
     ):  # fmt: skip
         field = np.full(len(vertices), np.nan)
         field[where] = values
@@ -99,5 +141,7 @@ def _on_surface(axes: Any, fit: Any, data: Observations, surface: Any) -> None:
         drawn.close()
     width = rows[0].shape[1] // 2
     axes.imshow(np.concatenate([row[:, :width] for row in rows], axis=1))
-    axes.set(title="observed, model, and model less observed")
+    time = "" if data.times is None else f" at t = {data.times[when]:g}"
+    count = f"; {int(is_far.sum())} outliers are outside the colours' range" if is_far.any() else ""
+    axes.set(title=f"observed, model, and model less observed{time}{count}")
     axes.set_axis_off()

@@ -1,8 +1,10 @@
 """A fit ready to run: residuals of a vector of unknowns, their derivatives, and the method that steps on them."""
 
+import collections
 import dataclasses
+import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import diffrax
@@ -21,18 +23,31 @@ from .unknowns import Unknowns
 # The first damping, relative to the Jacobian's norm: after Marquardt (1963), who begins with a hundredth of its square.
 _DAMPING = 0.1
 
+# Traced programs kept for a second fit of the same model.
+_KEPT = 8
+
 Model = Experiment | Callable[..., Any]
 Residuals = Callable[[Any], Any]
 
 
 class FitResiduals(eqx.Module):
-    """The residuals of a vector of unknowns: misfit to the data, then penalties."""
+    """The residuals of a vector of unknowns: misfit to the data, then penalties.
+
+    Attributes:
+        model: model.
+        data: data.
+        space: unknowns.
+        penalty: function from parameters to residuals that are added to those of the data.
+        adjoint: adjoint that makes time stepping differentiable in the mode needed.
+        spread: standard deviation of the misfit in units of the noise.
+    """
 
     model: Model
     data: Observations
     space: Unknowns
     penalty: Residuals | None
     adjoint: diffrax.AbstractAdjoint | None
+    spread: Array
 
     def predicted(self, z: Array) -> Any:
         """What the model gives."""
@@ -41,21 +56,55 @@ class FitResiduals(eqx.Module):
             return self.model(params, self.data.times, self.adjoint)
         return self.model(params) if self.adjoint is None else self.model(params, adjoint=self.adjoint)
 
-    def __call__(self, z: Array) -> Array:
-        """(M,) misfit in units of the noise, then penalties; infinite where the model fails."""
-        misfit = self.data.misfit(self.predicted(z))
+    def both(self, z: Array) -> tuple[Array, Array]:
+        """Residuals (M + P,) whose squared halves sum to the loss, infinite where the model fails; the misfit (M,)."""
+        misfit = self.data.misfit(self.predicted(z), self.space.calibration(z), self.spread)
+        residuals = self.data.loss.root(misfit)
         if self.penalty is not None:
-            misfit = jnp.concatenate([misfit, ravel_pytree(self.penalty(self.space.params(z)))[0].astype(misfit.dtype)])
-        return jnp.where(jnp.all(jnp.isfinite(misfit)), misfit, jnp.inf)
+            penalties = ravel_pytree(self.penalty(self.space.params(z)))[0]
+            residuals = jnp.concatenate([residuals, penalties.astype(misfit.dtype)])
+        return jnp.where(jnp.all(jnp.isfinite(residuals)), residuals, jnp.inf), misfit
+
+    def __call__(self, z: Array) -> Array:
+        """The residuals."""
+        return self.both(z)[0]
 
 
-def _jacobian(residuals: Callable[[Array], Array], z: Array, reverse: bool) -> tuple[Array, Array]:
-    """Residuals and their Jacobian (M, n), from one run of the model and its derivatives."""
+class Program(eqx.Module):
+    """The residuals as a traced program, which a second fit of the same model finds compiled.
+
+    Attributes:
+        run: program, from the arrays and a vector of unknowns to residuals and misfit.
+        arrays: `FitResiduals` reduced to its arrays.
+    """
+
+    run: Callable[[Any, Array], tuple[Array, Array]]
+    arrays: Any
+
+    def both(self, z: Array) -> tuple[Array, Array]:
+        """As of `FitResiduals`."""
+        return self.run(self.arrays, z)
+
+    def __call__(self, z: Array) -> Array:
+        """The residuals."""
+        return self.both(z)[0]
+
+    def with_spread(self, spread: Array) -> "Program":
+        """The same with another spread of the misfit."""
+        return eqx.tree_at(lambda program: program.arrays.spread, self, spread)
+
+
+AnyResiduals = FitResiduals | Program
+
+
+def _jacobian(residuals: AnyResiduals, z: Array, reverse: bool) -> tuple[tuple[Array, Array], Array]:
+    """Residuals and misfit, and the residuals' Jacobian (M + P, n), from one run of the model and its derivatives."""
     if reverse:
-        value, pull = jax.vjp(residuals, z)
-        return value, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size, dtype=value.dtype))
-    push = lambda column: jax.jvp(residuals, (z,), (column,))  # noqa: E731
-    return jax.vmap(push, out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
+        value, pull, misfit = jax.vjp(residuals.both, z, has_aux=True)
+        return (value, misfit), jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size, dtype=value.dtype))
+    push = lambda column: jax.jvp(residuals.both, (z,), (column,), has_aux=True)  # noqa: E731
+    value, jacobian, misfit = jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(z.size, dtype=z.dtype))
+    return (value, misfit), jacobian
 
 
 @eqx.filter_custom_jvp
@@ -68,14 +117,14 @@ def _linearised(z, residuals, reverse):
 @_linearised.def_jvp
 def _(primals, tangents):
     z, residuals, reverse = primals
-    value, jacobian = _jacobian(residuals, z, reverse)
+    (value, _), jacobian = _jacobian(residuals, z, reverse)
     return value, jacobian @ tangents[0]
 
 
 class _LeastSquares(eqx.Module):
     """What optimistix's least-squares solvers see."""
 
-    residuals: Callable[[Array], Array]
+    residuals: AnyResiduals
     scale: Array
     reverse: bool = eqx.field(static=True)
 
@@ -87,7 +136,7 @@ class _LeastSquares(eqx.Module):
 class _Loss(eqx.Module):
     """What optimistix's minimisers see."""
 
-    residuals: Callable[[Array], Array]
+    residuals: AnyResiduals
     scale: Array
 
     def __call__(self, z, args):
@@ -96,9 +145,18 @@ class _Loss(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A fit ready to run."""
+    """A fit ready to run.
+
+    Attributes:
+        residuals: residuals of a vector of unknowns.
+        program: the same, traced.
+        solver: optimiser.
+        reverse: whether derivatives are taken in reverse mode.
+        method: method and kind of derivatives, in words.
+    """
 
     residuals: FitResiduals
+    program: Program
     solver: Any
     reverse: bool = eqx.field(static=True)
     method: str = eqx.field(static=True)
@@ -118,32 +176,29 @@ class Problem(eqx.Module):
         """Whether the method sees residuals, not their loss alone."""
         return isinstance(self.solver, optx.AbstractLeastSquaresSolver)
 
-    def converted(self, z: Array) -> Any:
-        """The residuals with all arrays they read as leaves, so that none becomes a constant of the program."""
-        return eqx.filter_closure_convert(lambda z: self.residuals(z), z)
-
-    def function(self, converted: Any, z: Array) -> Any:
-        """What the solver steps on, scaled so that its first damping, 1, suits the problem."""
+    def function(self, residuals: AnyResiduals, z: Array) -> tuple[Any, tuple[Array, Array]]:
+        """What the solver steps on, scaled so that its first damping, 1, suits the problem; residuals and misfit."""
         if not self.is_least_squares:
             # A first step along the gradient then has the length of one.
-            slope = _gradient(converted, z)
-            return _Loss(converted, 1 / jnp.sqrt(_or_one(jnp.linalg.norm(slope))))
-        _, jacobian = jacobian_of(converted, z, self.reverse)
-        return _LeastSquares(converted, 1 / _or_one(_DAMPING * jnp.linalg.norm(jacobian)), self.reverse)
+            slope, values = _gradient(residuals, z)
+            return _Loss(residuals, 1 / jnp.sqrt(_or_one(jnp.linalg.norm(slope)))), values
+        values, jacobian = jacobian_of(residuals, z, self.reverse)
+        scale = 1 / _or_one(_DAMPING * jnp.linalg.norm(jacobian))
+        return _LeastSquares(residuals, scale, self.reverse), values
 
-    def profile(self, params: Any, name: str, values: np.ndarray, max_steps: int) -> np.ndarray:
+    def profile(
+        self, residuals: Program, z0: Array, name: str, values: np.ndarray, max_steps: int
+    ) -> np.ndarray:  # fmt: skip
         """(P,) the least losses with one parameter held at each of some values, from the optimum outwards."""
         if name not in self.space.names:
             raise ValueError(f"There is no parameter {name!r}; there are {', '.join(self.space.names)}.")
         if not self.is_least_squares:
             raise ValueError("Profiles need a least-squares method: ltl.fit(..., method=optx.LevenbergMarquardt(...)).")
         index = self.space.names.index(name)
-        flat, rebuild = ravel_pytree(jax.tree.map(jnp.asarray, params))
-        z0 = self.space.free(params)
-        converted = self.converted(z0)
-        scale = self.function(converted, z0).scale
+        flat, rebuild = ravel_pytree(self.space.values(z0))
+        scale = self.function(residuals, z0)[0].scale
         if len(z0) == 1:
-            at = [converted(self.space.free(rebuild(flat.at[index].set(value)))) for value in values]
+            at = [residuals(self.space.free(rebuild(flat.at[index].set(value)))) for value in values]
             return np.array([0.5 * float(jnp.sum(r**2)) for r in at])
         losses = np.empty(len(values))
         rest = jnp.delete(z0, index)
@@ -156,7 +211,7 @@ class Problem(eqx.Module):
                 raise ValueError(f"{name} = {values[k]:g} is outside the range of the parameter.")
             near = min(known, key=lambda j: abs(values[j] - values[k]), default=None)
             z = rest if near is None else known[near]
-            solution = _profiled(converted, self.solver, scale, z, held, index, self.reverse, max_steps)
+            solution = _profiled(residuals, self.solver, scale, z, held, index, self.reverse, max_steps)
             known[int(k)] = solution.value
             losses[k] = 0.5 * float(jnp.sum(solution.aux**2))
         return losses
@@ -168,25 +223,35 @@ def _or_one(norm: Array) -> Array:
 
 
 @eqx.filter_jit
-def jacobian_of(converted, z, reverse):
-    """Residuals and their Jacobian (M, n), compiled once for a problem."""
-    return _jacobian(converted, z, reverse)
+def jacobian_of(residuals, z, reverse):
+    """Residuals and misfit, and the residuals' Jacobian, compiled once for a problem."""
+    return _jacobian(residuals, z, reverse)
 
 
 @eqx.filter_jit
-def _gradient(converted, z):
-    return jax.grad(lambda z: 0.5 * jnp.sum(converted(z) ** 2))(z)
+def values_of(residuals, z):
+    """Residuals and misfit, compiled once for a problem."""
+    return residuals.both(z)
 
 
 @eqx.filter_jit
-def _profiled(converted, solver, scale, rest, held, index, reverse, max_steps):
-    def residuals(rest, args):
+def _gradient(residuals, z):
+    def loss(z):
+        values = residuals.both(z)
+        return 0.5 * jnp.sum(values[0] ** 2), values
+
+    return jax.grad(loss, has_aux=True)(z)
+
+
+@eqx.filter_jit
+def _profiled(residuals, solver, scale, rest, held, index, reverse, max_steps):
+    def scaled(rest, args):
         del args
         z = jnp.concatenate([rest[:index], held[None], rest[index:]])
-        value = _linearised(z, converted, reverse)
+        value = _linearised(z, residuals, reverse)
         return scale * value, value
 
-    return optx.least_squares(residuals, solver, rest, has_aux=True, throw=False, max_steps=max_steps)
+    return optx.least_squares(scaled, solver, rest, has_aux=True, throw=False, max_steps=max_steps)
 
 
 def prepare(
@@ -194,20 +259,59 @@ def prepare(
     rtol: float, atol: float,
 ) -> Problem:  # fmt: skip
     """The problem, its method and derivatives chosen, its shapes checked."""
-    plain = FitResiduals(model, data, space, penalty, forward_adjoint(model))
-    takes_adjoint = plain.adjoint is not None
-    prediction = eqx.filter_eval_shape(lambda z: plain.predicted(z), z)
-    data.check(prediction)
-    num_residuals = eqx.filter_eval_shape(lambda z: plain(z), z).size
-    if num_residuals < z.size:
+    spread = jnp.ones(data.spread_shape, z.dtype)
+    plain = FitResiduals(model, data, space, penalty, forward_adjoint(model), spread)
+    solver, name = method_of(method, z.size, rtol, atol, space.reach)
+    is_least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+    key = _key(plain, z, is_least_squares)
+    if key is None or key not in _TRACED:
+        traced = _traced(plain, z, is_least_squares)
+        if key is not None:
+            _TRACED[key] = *traced, (model, penalty)
+        while len(_TRACED) > _KEPT:
+            _TRACED.popitem(last=False)
+    else:
+        traced = _TRACED[key][:-1]
+        _TRACED.move_to_end(key)
+    run, adjoint, reverse, num_residuals, how = traced
+    num_values = num_residuals - data.values.size + data.num_values
+    if num_values < z.size:
         raise ValueError(
-            f"Expected at least as many values as unknowns, found {num_residuals} for {z.size}. Observe more, fit "
+            f"Expected at least as many values as unknowns, found {num_values} for {z.size}. Observe more, fit "
             "fewer parameters, or add what is known as penalty= (ltl.smoothness, say)."
         )
-    solver, name = method_of(method, z.size, rtol, atol)
-    if isinstance(solver, optx.AbstractLeastSquaresSolver):
-        reverse = False
-        how = f"its Jacobian in forward mode, {z.size} tangents beside each run"
+    residuals = dataclasses.replace(plain, adjoint=adjoint)
+    program = Program(run, eqx.filter(_without_model(plain), is_on_device))
+    return Problem(residuals, program, solver, reverse, f"{name}, {how}")
+
+
+def is_on_device(leaf: Any) -> bool:
+    """Whether a leaf is an argument of the program; NumPy arrays, such as times, belong to the program itself."""
+    return isinstance(leaf, jax.Array)
+
+
+def _without_model(residuals: FitResiduals) -> FitResiduals:
+    """What differs from fit to fit of the same model: data, unknowns and spread."""
+    return dataclasses.replace(residuals, model=None, penalty=None, adjoint=None)
+
+
+# Each with the model and the penalty whose arrays its key names by their identity, so that they live as long.
+_TRACED: collections.OrderedDict[Hashable, tuple[Any, Any, bool, int, str, Any]] = collections.OrderedDict()
+
+
+def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any, Any, bool, int, str]:
+    """The program of the residuals, its adjoint, whether derivatives are in reverse mode, the number of residuals, and
+    how derivatives are taken, in words.
+
+    The model's arrays are known while it is traced, since what is measured of a surface on the host is only known of
+    such; then they become arguments, so that none is a constant of the program.
+    """
+    takes_adjoint = plain.adjoint is not None
+    plain.data.check(eqx.filter_eval_shape(lambda z: plain.predicted(z), z))
+    num_residuals = eqx.filter_eval_shape(lambda z: plain(z), z).size
+    reverse, how = True, f"gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}"
+    if is_least_squares:
+        reverse, how = False, f"its Jacobian in forward mode, {z.size} tangents beside each run"
         if not _goes_forward(plain, z):
             if num_residuals > MANY:
                 raise ValueError(
@@ -215,11 +319,38 @@ def prepare(
                     "ltl.solve, or choose a method that needs gradients alone: method=optx.BFGS(rtol, atol)."
                 )
             reverse, how = True, f"its Jacobian in reverse mode, {num_residuals} rows"
-        return Problem(plain, solver, reverse, f"{name}, {how}")
-    return Problem(
-        dataclasses.replace(plain, adjoint=None), solver, True,
-        f"{name}, gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}",
-    )  # fmt: skip
+    else:
+        plain = dataclasses.replace(plain, adjoint=None)
+    arrays, rest = eqx.partition(_without_model(plain), is_on_device)
+    own = dict(model=plain.model, penalty=plain.penalty, adjoint=plain.adjoint)
+    run = eqx.filter_closure_convert(
+        lambda arrays, z: dataclasses.replace(eqx.combine(arrays, rest), **own).both(z), arrays, z
+    )
+    return run, plain.adjoint, reverse, num_residuals, how
+
+
+def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
+    """What the program of the residuals depends on beside data, unknowns and spread; None where that cannot be told.
+
+    Functions and the arrays of a model count as the same if they are the same object, as functions do for `jax.jit`.
+    """
+
+    def fixed(leaf: Any) -> Hashable:
+        if is_on_device(leaf):
+            return id(leaf)
+        if isinstance(leaf, np.ndarray):
+            return leaf.shape, leaf.dtype.str, hashlib.sha256(leaf.tobytes()).digest()
+        return type(leaf), leaf
+
+    arrays, rest = eqx.partition(_without_model(plain), is_on_device)
+    shapes = tuple((leaf.shape, str(leaf.dtype), bool(leaf.weak_type)) for leaf in jax.tree.leaves(arrays))
+    leaves, structure = jax.tree.flatten((rest, plain.model, plain.penalty, plain.adjoint))
+    key = shapes, tuple(map(fixed, leaves)), structure, z.shape, str(z.dtype), is_least_squares
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
 
 
 def forward_adjoint(model: Model) -> diffrax.AbstractAdjoint | None:

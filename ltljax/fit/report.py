@@ -17,8 +17,8 @@ from .unknowns import Unknowns
 _UNSEEN = 1e-2
 # One standard deviation, relative, from which on a direction counts as not determined.
 _VAGUE = 0.5
-# Residuals that are so many times the noise are not noise.
-_UNEXPLAINED = 2.0
+# Outliers that a report names.
+_NAMED = 5
 # Values that must be left beside those the parameters take for the noise to be estimated.
 _LEFT = 0.5
 
@@ -28,17 +28,23 @@ class Evidence:
     """What a fit's Jacobian says.
 
     Attributes:
-        names: of the parameters, flattened.
-        values: (n,) of the parameters.
-        covariance: (n, n): (J^T J)^-1, times the variance of the residuals where the noise is not known.
+        names: names of the parameters, flattened, and of what was unknown about the data.
+        values: (n,) their values.
+        covariance: (n, n): (J^T J)^-1; where the noise is not known (J^T J)^-1 J^T D J (J^T J)^-1 with the variance D
+            of the residuals, taken from those of each species; of a robust loss the sandwich A^-1 B A^-1, with A the
+            second derivative of the loss along J and B the sum of its squared slopes (Huber 1967; White 1980).
         std: (n,) standard deviations.
         intervals: the lower and upper ends of the confidence intervals, each as the parameters; they are symmetric in
             the free unknowns, so that a positive parameter's stays positive.
-        confidence: of the intervals.
+        ends: (2, n) the same ends, flattened as ``values``.
+        at_end: (n,) which values have run to an end of their range.
+        confidence: confidence of the intervals.
         singular_values: (n,) of the data's Jacobian with respect to relative changes; descending.
         directions: (n, n) in rows, the relative changes that belong to them.
         noise: the standard deviation of the data's residuals, 1 if model and noise level are right, or where the noise
-            was not given in the data's own unit; NaN where no value is left to tell it.
+            was not given in the data's own unit; NaN where no value is left to tell it. With a robust loss it is taken
+            from the median, and is the root mean square over the species.
+        degrees_of_freedom: number of values less those that the parameters take.
         cannot_tell: a sentence for each direction that the data do not determine.
     """
 
@@ -47,16 +53,20 @@ class Evidence:
     covariance: np.ndarray
     std: np.ndarray
     intervals: tuple[Any, Any]
+    ends: np.ndarray
+    at_end: np.ndarray
     confidence: float
     singular_values: np.ndarray
     directions: np.ndarray
     noise: float
+    degrees_of_freedom: float
     cannot_tell: tuple[str, ...]
 
 
 def evidence(
-    space: Unknowns, z: Array, data: Observations, residuals: Array, jacobian: Array, confidence: float, adaptive: bool
-) -> Evidence:
+    space: Unknowns, z: Array, data: Observations, residuals: Array, misfit: Array, jacobian: Array,
+    spread: np.ndarray, confidence: float, adaptive: bool,
+) -> Evidence:  # fmt: skip
     """The evidence at a minimum.
 
     The variance of the data's residuals is their sum of squares over the degrees of freedom that parameters leave, M -
@@ -67,39 +77,54 @@ def evidence(
         space: the unknowns.
         z: (n,) their vector.
         data: what was fitted.
-        residuals: (M + P,) misfit and penalties.
-        jacobian: (M + P, n) of them, with respect to z.
-        confidence: of the intervals.
+        residuals: (M + P,) roots of the losses of the misfit, which are the misfit in least squares, and penalties.
+        misfit: (M,) misfit.
+        jacobian: (M + P, n) derivative of the residuals with respect to z.
+        spread: standard deviation that the misfit is divided by where it is taken from the data.
+        confidence: confidence of the intervals.
         adaptive: whether the model takes adaptive steps, whose errors hide what shows less.
     """
     from scipy import stats
 
     r, j = np.asarray(residuals, np.float64), np.asarray(jacobian, np.float64)
     size, num_values = j.shape[1], data.values.size
+    is_known = data.knows_noise or data.estimates_spread
     u, s, vt = np.linalg.svd(j, full_matrices=False)
     safe = np.maximum(s, np.finfo(np.float64).eps * (s[0] or 1.0))
-    free = num_values - float(np.sum((j[:num_values] @ (vt.T / safe)) ** 2))
-    spread = float(np.sqrt(np.sum(r[:num_values] ** 2) / free)) if free > _LEFT else float("nan")
-    sigma = 1.0 if data.noise is not None else spread
-    in_z = (vt.T / safe**2) @ vt * sigma**2
-    params = space.params(z)
+    # What each value takes of the degrees of freedom.
+    taken = np.sum((j[:num_values] @ (vt.T / safe)) ** 2, axis=1)
+    free = data.num_values - float(np.sum(taken))
+    noise = float(np.sqrt(np.sum(r[:num_values] ** 2) / free)) if free > _LEFT else float("nan")
+    sigma = 1.0 if is_known else noise
+    if data.loss.is_robust:
+        in_z = _sandwich(data, np.asarray(misfit, np.float64), j, free)
+        noise = float(np.sqrt(np.mean(spread**2)))
+        if data.knows_noise:
+            noise = float(data.median_spread(np.reshape(np.asarray(misfit), data.values.shape)).mean())
+    else:
+        in_z = (vt.T / safe**2) @ vt * sigma**2
+        if not is_known and data.has_species and np.isfinite(sigma):
+            left = vt.T / safe**2 @ vt
+            variances = _variances(data, r[:num_values], taken, sigma**2)
+            weights = np.concatenate([variances, np.full(len(r) - num_values, sigma**2)])
+            in_z = left @ ((j * weights[:, None]).T @ j) @ left
+    values_there = space.values(z)
     slopes = np.asarray(space.slopes(z), np.float64)
     std_z = np.sqrt(np.diag(in_z))
-    quantile = stats.norm.ppf if data.noise is not None else lambda p: stats.t.ppf(p, max(free, _LEFT))
+    quantile = stats.norm.ppf if data.knows_noise else lambda p: stats.t.ppf(p, max(free, _LEFT))
     reach = float(quantile(0.5 + confidence / 2)) * std_z
-    ends = tuple(space.params(z + jnp.asarray(side * reach, z.dtype)) for side in (-1, 1))
-    values = _flat(params)
+    ends = [space.values(z + jnp.asarray(side * reach, z.dtype)) for side in (-1, 1)]
+    values = _flat(values_there)
     # Where a step of Gauss and Newton in the parameters themselves leads: in a minimum nowhere, at a bound beyond it.
-    at_end = space.at_end(params, values - slopes * ((vt.T / safe) @ (u.T @ r)))
+    at_end = space.at_end(values_there, values - slopes * ((vt.T / safe) @ (u.T @ r)))
     # Relative changes; of parameters near zero changes by the scale of the start.
-    leaves = jax.tree.leaves(params)
+    leaves = jax.tree.leaves(values_there)
     scales = _flat([np.full(np.shape(leaf), scale) for scale, leaf in zip(space.scales, leaves, strict=True)])
     sizes = np.maximum(np.abs(values), 1e-3 * scales)
     relative = j[:num_values] * (sizes / np.where(slopes == 0, 1.0, slopes))
     _, singular, directions = np.linalg.svd(relative, full_matrices=num_values < size)
     singular = np.concatenate([singular, np.zeros(size - len(singular))])
-    level = float(np.std(np.asarray(data.values / (1.0 if data.noise is None else data.noise)))) * np.sqrt(num_values)
-    level = level or float(np.linalg.norm(np.asarray(data.values))) or 1.0
+    level = _level(data, spread)
     rounding = float(np.sqrt(jnp.finfo(jacobian.dtype).eps))
     said = [
         f"{name} has run to the end of its range, {value:.4g}: the data would have it there or beyond, and its "
@@ -119,9 +144,54 @@ def evidence(
             less = "less than the errors that adaptive steps may have: tighten rtol and atol, or give dt="
             said.append(_sentence(space.names, direction, share, "safely tell", less))
     return Evidence(
-        space.names, values, slopes[:, None] * in_z * slopes, slopes * std_z, (ends[0], ends[1]), confidence, singular,
-        directions, spread, tuple(said),
+        space.names, values, slopes[:, None] * in_z * slopes, slopes * std_z, (ends[0][0], ends[1][0]),
+        np.array([_flat(end) for end in ends]), at_end, confidence, singular, directions, noise, free, tuple(said),
     )  # fmt: skip
+
+
+def _sandwich(data: Observations, misfit: np.ndarray, jacobian: np.ndarray, free: float) -> np.ndarray:
+    """The covariance of unknowns found with a robust loss.
+
+    With the slopes g and second derivatives h of the loss at each residual, whose own Jacobian is J / q' for roots q
+    with the Jacobian J, B = sum g^2 / q'^2 J^T J = sum q^2 J^T J and A = sum h / q'^2 J^T J. Penalties enter both as
+    data do. Where A is not positive definite J^T J takes its place.
+    """
+    slope, bend = data.loss.influence(misfit)
+    root = np.asarray(data.loss.root(jnp.asarray(misfit)))
+    # The slope of the root: g / q, and 1 at zero.
+    inner = np.where(np.abs(root) > 1e-6, slope / np.where(root == 0, 1, root), 1.0)
+    weights = np.where(np.abs(inner) > 1e-12, bend / np.where(inner == 0, 1, inner) ** 2, 0.0)
+    count = len(misfit)
+    held = jacobian[count:].T @ jacobian[count:]
+    own = jacobian[:count]
+    outer = (own * weights[:, None]).T @ own + held
+    if np.linalg.eigvalsh(outer)[0] <= 0:
+        outer = own.T @ own + held
+    middle = (own * root[:, None] ** 2).T @ own * (data.num_values / max(free, 1.0)) + held
+    inverse = np.linalg.pinv(outer)
+    return inverse @ middle @ inverse
+
+
+def _variances(data: Observations, residuals: np.ndarray, taken: np.ndarray, all_of_them: float) -> np.ndarray:
+    """(M,) variance of the residuals of each value's species; of all together where that species leaves too few."""
+    shape, mask = data.values.shape, np.asarray(data.mask)
+    found = np.full(shape, all_of_them)
+    for column in data.columns:
+        free = np.sum(mask[column]) - np.sum(taken.reshape(shape)[column])
+        if free > 1:
+            found[column] = np.sum(residuals.reshape(shape)[column] ** 2) / free
+    return found.ravel()
+
+
+def _level(data: Observations, spread: np.ndarray) -> float:
+    """The size of the data's variation, in the unit of the misfit."""
+    values = np.asarray(data.values, np.float64)
+    noise = np.broadcast_to(1.0 if data.noise is None else np.asarray(data.noise, np.float64), values.shape)
+    units = np.broadcast_to(spread, values.shape) * noise
+    if data.is_count:
+        units = np.sqrt(np.maximum(values, 1))
+    seen = (values / units)[np.asarray(data.mask)]
+    return float(np.std(seen) * np.sqrt(seen.size)) or float(np.linalg.norm(seen)) or 1.0
 
 
 def _flat(tree: Any) -> np.ndarray:
@@ -145,11 +215,14 @@ def _sentence(names: tuple[str, ...], direction: np.ndarray, share: float, verb:
 
 
 def summary(fit: Any, data: Observations) -> str:
-    """The table of a fit, and in words how well it is known."""
-    lines = [
-        f"{fit.method}: {fit.num_steps} steps, {fit.num_runs} runs of the model, loss {fit.loss:.4g}; stopped because "
-        f"{fit.reason}."
-    ]
+    """The table of a fit, and in words whether the model explains the data and how well its parameters are known."""
+    lines = [fit.agreement.sentence()]
+    if fit.scanned:
+        lines.append(fit.scanned)
+    lines.append(
+        f"{fit.method}: {fit.num_steps} steps, {fit.num_runs} runs of the model, loss {fit.loss:.4g}; {fit.status}, "
+        f"because {fit.reason}."
+    )
     known = fit.evidence
     if known is None:
         leaves = jax.tree_util.tree_flatten_with_path(fit.params)[0]
@@ -158,29 +231,71 @@ def summary(fit: Any, data: Observations) -> str:
             f"{np.max(leaf):.4g}"
             for path, leaf in leaves
         ]
-        return "\n".join(lines)
-    lows, highs = (_flat(end) for end in known.intervals)
+        return "\n".join([*lines, *_outliers(fit, data)])
     width = max(9, *(len(name) for name in known.names))
     lines.append(f"  {'parameter':{width}} {'value':>12} {'std':>10}   {100 * known.confidence:.0f} % interval")
     lines += [
         f"  {name:{width}} {value:12.6g} {std:10.2g}   {low:.6g} to {high:.6g}"
-        for name, value, std, low, high in zip(known.names, known.values, known.std, lows, highs, strict=True)
+        for name, value, std, low, high in zip(known.names, known.values, known.std, *known.ends, strict=True)
     ]
     if np.isfinite(known.noise):
-        unit = "estimated noise" if data.noise is None else "residuals over noise (1 if model and noise are right)"
+        unit = "residuals over noise (1 if model and noise are right)" if data.knows_noise else "estimated noise"
         lines.append(f"{unit}: {known.noise:.3g}")
     lines.append("singular values: " + ", ".join(f"{value:.3g}" for value in known.singular_values))
-    if data.noise is not None and known.noise > _UNEXPLAINED:
-        return "\n".join([
-            *lines,
-            f"The model does not explain the data: what remains is {known.noise:.2g} times the noise, and the "
-            "intervals mean nothing. Begin elsewhere (ltl.explore, ltl.fit_many), or doubt the model or the noise.",
-            *known.cannot_tell,
-        ])  # fmt: skip
-    if data.noise is None and not np.isfinite(known.noise):
+    lines += _outliers(fit, data)
+    lines += _advice(fit, data)
+    if not data.knows_noise and not np.isfinite(known.noise):
         lines.append(
-            f"There are no error bars: {data.values.size} values for {len(known.values)} unknowns leave none to tell "
+            f"There are no error bars: {data.num_values} values for {len(known.values)} unknowns leave none to tell "
             "the noise from. Give Observations(..., noise=...), or observe more."
         )
-        return "\n".join([*lines, *known.cannot_tell])
-    return "\n".join([*lines, *(known.cannot_tell or ["The data determine every parameter."])])
+    elif not known.cannot_tell and fit.status == "converged":
+        lines.append("The data determine every parameter.")
+    return "\n".join([*lines, *known.cannot_tell])
+
+
+def _advice(fit: Any, data: Observations) -> list[str]:
+    """What to do where the model does not explain the data."""
+    agreement = fit.agreement
+    if not (agreement.is_useless or agreement.is_unexplained or agreement.is_structured):
+        return []
+    trouble = "The intervals mean nothing."
+    if not (agreement.is_useless or agreement.is_unexplained):
+        trouble = "The intervals are too narrow: they take residuals for independent noise."
+    if len(agreement.outliers) and not agreement.has_many_outliers and not data.loss.is_robust:
+        return [f'{trouble} Begin with the outliers: Observations(..., loss="huber").']
+    return [
+        f"{trouble} Doubt the model or the noise, begin elsewhere (ltl.explore, ltl.fit_many), or give what is unknown "
+        "about the data, such as Observations(scale=Positive(1.0), offset=Real(0.0))."
+    ]
+
+
+def _outliers(fit: Any, data: Observations) -> list[str]:
+    """How many values are outliers, where the farthest are, and what they do."""
+    found = fit.agreement.outliers
+    if not len(found) or fit.agreement.has_many_outliers:
+        return []
+    named = "; ".join(_place(data, index) for index in found[:_NAMED])
+    more = f"; and {len(found) - _NAMED} more (fit.agreement.outliers)" if len(found) > _NAMED else ""
+    what = "count less" if data.loss.is_robust else 'count in full: loss="huber" limits what they can do'
+    are = "1 value is an outlier" if len(found) == 1 else f"{len(found)} of {data.num_values} values are outliers"
+    return [
+        f"{are}, more than {fit.agreement.outlier_limit:.1f} standard deviations from the model, and {what}: "
+        f"{named}{more}."
+    ]
+
+
+def _place(data: Observations, index: np.ndarray) -> str:
+    """Where and when a value was measured, and the value."""
+    parts, axis = [], 0
+    if data.times is not None:
+        parts.append(f"t = {data.times[index[0]]:g}")
+        axis = 1
+    if len(index) > axis:
+        kind = "vertex" if data.sampling is None else "place"
+        place = index[axis] if data.vertices is None else data.vertices[index[axis]]
+        parts.append(f"{kind} {place}")
+    if data.has_species and data.values.shape[-1] > 1:
+        column = index[-1] if data.species is None else data.species[index[-1]]
+        parts.append(f"species {column}")
+    return f"{', '.join(parts) or 'the value'} ({float(data.values[tuple(index)]):.4g})"

@@ -121,7 +121,9 @@ def _npz(path: Path) -> dict[str, Any]:
 def _csv(path: Path) -> dict[str, Any]:
     lines = path.read_text(encoding="utf-8-sig").splitlines()  # spreadsheets begin with a mark
     names = [name.strip() for name in lines[0].split(",")]
-    values = np.array([[float(entry) for entry in line.split(",")] for line in lines[1:] if line.strip()])
+    # An empty entry is a missing value.
+    rows = [line.split(",") for line in lines[1:] if line.strip()]
+    values = np.array([[float(entry) if entry.strip() else np.nan for entry in row] for row in rows])
     if values.ndim != 2 or values.shape[1] != len(names):
         raise ValueError(f"expected rows of {len(names)} numbers below the names")
     return {name: _integers(column) for name, column in zip(names, values.T, strict=True)}

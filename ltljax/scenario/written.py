@@ -72,6 +72,15 @@ def library() -> dict[str, str]:
     return {name: found[name].read_text(encoding="utf-8") for name in sorted(found)}
 
 
+def templates() -> dict[str, str]:
+    """The texts of scenario files to start from, by name: those of the library, and those that need files of data."""
+    folder = files("ltljax.scenario") / "templates"
+    return library() | {
+        entry.name.removesuffix(".toml"): entry.read_text(encoding="utf-8")
+        for entry in folder.iterdir() if entry.name.endswith(".toml")
+    }  # fmt: skip
+
+
 def title(text: str) -> str:
     """The title of a scenario of the library."""
     return str(load(text, "library")["title"])
@@ -117,7 +126,7 @@ def read(
     root = Table(tables, name)
     title = root.text("title", _plain(Path(name).stem))
     seed = root.count("seed", 0, 0, 2**63 - 1)
-    mesh, used, note = _mesh(root.table("mesh"), folder if mesh_file is None else mesh_file.parent)
+    mesh, used, note, factor = _mesh(root.table("mesh"), folder if mesh_file is None else mesh_file.parent)
     place = _places(root.table("bumps"), mesh, seed)
     scale = root.number("scale", 1.0, 1e-3, 1e3)
     make_equation, species, numbers = _equation(root, mesh, place, scale)
@@ -133,7 +142,7 @@ def read(
         )
     start, start_file = _start(root.table("initial"), mesh, place, species, folder)
     settings = _settings(root, species)
-    sought = wanted(root.table("fit"), numbers, mesh, species, end, folder)
+    sought = wanted(root.table("fit"), numbers, mesh, species, end, folder, factor)
     root.finish()
     named = {"mesh.file": used, "initial.file": start_file}
     named |= {f"fit.data.{index}.file": path for index, path in enumerate(sought.files if sought else ())}
@@ -170,7 +179,8 @@ def _plain(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)[:60] or "scenario"
 
 
-def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...]]:
+def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...], float]:
+    """The mesh, its file, a note on its scale, and the factor by which the coordinates of the file were multiplied."""
     if "file" in table:
         path = table.file("file", folder)
         repair = table.flag("repair", False)
@@ -182,9 +192,9 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
         except MeshError as error:
             raise table.refused("file", error) from None
         if scale == "keep":
-            return mesh, path, (f"The mesh keeps its scale: area {mesh.area:.6g}.",)
-        mesh, note = scaled_to_unit_area(mesh)
-        return mesh, path, (note,)
+            return mesh, path, (f"The mesh keeps its scale: area {mesh.area:.6g}.",), 1.0
+        scaled, note = scaled_to_unit_area(mesh)
+        return scaled, path, (note,), math.sqrt(scaled.area / mesh.area)
     shape = table.choice("shape", tuple(_SHAPES), "sphere")
     make, counts = _SHAPES[shape]
     arguments: dict[str, Any] = {
@@ -197,7 +207,7 @@ def _mesh(table: Table, folder: Path) -> tuple[Mesh, Path | None, tuple[str, ...
         elif key not in counts:
             arguments[key] = table.number(key, float(parameter.default), 1e-3, 1e3)
     table.finish()
-    return make(**arguments), None, ()
+    return make(**arguments), None, (), 1.0
 
 
 def _places(table: Table, mesh: Mesh, seed: int) -> Callable[[Formula, str], np.ndarray]:
