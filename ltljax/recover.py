@@ -67,17 +67,18 @@ def recover(
     folder.check(_RESULTS, (*inputs, *example.files.values(), *wanted.files))
     if restart.owns(_UNKNOWNS) and not resume and not overwrite:
         raise RestartError(f"{restart.path} holds a fit that has not converged. {_WAYS}")
-    with folder.locked(), noted(FarFromOriginWarning):
-        surface = Surface.from_mesh(example.mesh, scheme, example.settings.dtype)
-        settings = example.settings
+    settings = example.settings
+    with noted(FarFromOriginWarning):
+        surface = Surface.from_mesh(example.mesh, scheme, settings.dtype)
+    try:
+        data = _observations(wanted, surface)
+    except ValueError as error:
+        raise ScenarioError(f"{example.name}: fit: {error}") from None
+    with folder.locked():
         experiment = Experiment(
             lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
             solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
         )  # fmt: skip
-        try:
-            data = _observations(wanted, surface)
-        except ValueError as error:
-            raise ScenarioError(f"{example.name}: fit.data: {error}") from None
         found = fit(
             experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
             checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),

@@ -32,6 +32,8 @@ class Observations(eqx.Module):
     masked were not measured, and are left out.
 
     Example:
+        >>> import numpy as np
+        >>> import ltljax as ltl
         >>> values = np.array([[1.0, 2.0, np.nan], [3.0, 60.0, 5.0]])
         >>> data = ltl.Observations(values, noise=0.1, times=[0.5, 1.0], loss="huber")
         >>> data.num_values

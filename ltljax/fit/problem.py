@@ -196,7 +196,9 @@ class Problem(eqx.Module):
             raise ValueError("Profiles need a least-squares method: ltl.fit(..., method=optx.LevenbergMarquardt(...)).")
         index = self.space.names.index(name)
         flat, rebuild = ravel_pytree(self.space.values(z0))
-        scale = self.function(residuals, z0)[0].scale
+        scale, solver = self.function(residuals, z0)[0].scale, self.solver
+        if getattr(solver, "reach", None) is not None:
+            solver = eqx.tree_at(lambda s: s.reach, solver, jnp.delete(solver.reach, index))
         if len(z0) == 1:
             at = [residuals(self.space.free(rebuild(flat.at[index].set(value)))) for value in values]
             return np.array([0.5 * float(jnp.sum(r**2)) for r in at])
@@ -211,7 +213,7 @@ class Problem(eqx.Module):
                 raise ValueError(f"{name} = {values[k]:g} is outside the range of the parameter.")
             near = min(known, key=lambda j: abs(values[j] - values[k]), default=None)
             z = rest if near is None else known[near]
-            solution = _profiled(residuals, self.solver, scale, z, held, index, self.reverse, max_steps)
+            solution = _profiled(residuals, solver, scale, z, held, index, self.reverse, max_steps)
             known[int(k)] = solution.value
             losses[k] = 0.5 * float(jnp.sum(solution.aux**2))
         return losses

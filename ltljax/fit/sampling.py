@@ -57,6 +57,8 @@ def observe_at(surface: Surface, points: Float[AnyArray, "M 3"], within: float |
         ValueError: a point is farther away, or not finite.
 
     Example:
+        >>> import numpy as np
+        >>> import ltljax as ltl
         >>> surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
         >>> sampling = ltl.observe_at(surface, np.array([[0.6, 0.0, 0.8]]))
         >>> print(f"{sampling(surface.vertices[:, 0])[0]:.2f}")
@@ -93,10 +95,12 @@ def observe_patches(surface: Surface, patches: Sequence[Any] | AnyArray) -> Samp
         ValueError: a patch has no vertices, or a vertex that the surface does not have.
 
     Example:
+        >>> import numpy as np
+        >>> import ltljax as ltl
         >>> surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
         >>> north = np.asarray(surface.vertices[:, 2]) > 0
         >>> print(f"{ltl.observe_patches(surface, [north])(surface.vertices[:, 2])[0]:.2f}")
-        0.51
+        0.53
     """
     size = surface.num_vertices
     if isinstance(patches, np.ndarray | Array) and np.ndim(patches) == 1:
