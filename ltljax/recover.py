@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
-from .fit import Agreement, Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
+from .fit import Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
 from .folder import Folder
 from .lifting.schemes import Scheme
 from .progress import noted
@@ -39,7 +39,7 @@ def recover(
 
     In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
     ``fitted.toml``, the scenario with the numbers found, to be run; and ``restart/unknowns.npz``, to resume from, until
-    the fit has converged.
+    the fit has settled.
 
     Args:
         example: the scenario.
@@ -47,13 +47,13 @@ def recover(
         out: the folder to write to; made if absent.
         inputs: files that are read beside those the scenario names, and must not be replaced.
         resume: whether to begin with what an interrupted fit of the same data left there.
-        overwrite: whether to start over although the folder holds a fit that has not converged.
+        overwrite: whether to start over although the folder holds a fit that has not settled.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.
         OutputError: the results would replace one of the files that are read, or one that ltljax has not written; or
             another fit is writing there.
-        RestartError: the folder holds another fit, or one that has not converged and neither ``resume`` nor
+        RestartError: the folder holds another fit, or one that has not settled and neither ``resume`` nor
             ``overwrite`` was given.
         FitError: the run fails at the first guess.
     """
@@ -83,9 +83,10 @@ def recover(
             experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
             checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),
         )  # fmt: skip
-        print(found.summary())
+        numbers = np.argsort(example.mesh.source_order)
+        print(found.summary(numbers))
         with folder.draft() as draft:
-            files = _write(example, found, surface, draft)
+            files = _write(example, found, _rows(wanted, found, numbers), draft)
         if found.has_settled:
             with restart.locked():
                 restart.remove_itself()
@@ -113,17 +114,26 @@ def _observations(wanted: Wanted, surface: Surface) -> Observations:
     return Observations(wanted.values, times=wanted.times, species=wanted.species, **options)
 
 
-def _plain(agreement: Agreement) -> dict[str, Any]:
-    """The agreement of model and data as plain values."""
-    return dataclasses.asdict(agreement) | dict(outliers=agreement.outliers.tolist())
+def _rows(wanted: Wanted, found: Fit, numbers: np.ndarray) -> list[dict[str, Any]]:
+    """The outliers by time, by the row of their file, from 0, and by species."""
+    is_whole = wanted.places.vertices is None and wanted.places.points is None and wanted.places.patches is None
+    return [
+        dict(
+            time=float(wanted.times[when]),
+            row=int(numbers[where] if is_whole else where),
+            species=int(wanted.species[s]),
+        )
+        for when, where, s in found.agreement.outliers.tolist()
+    ]
 
 
-def _write(example: Scenario, found: Fit, surface: Surface, out: Path) -> list[str]:
+def _write(example: Scenario, found: Fit, outliers: list[dict[str, Any]], out: Path) -> list[str]:
     numbers = {key: float(value) for key, value in found.params.items()}
     record: dict[str, Any] = dict(
         scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, runs=found.num_runs,
         reason=found.reason, status=found.status, converged=found.converged, method=found.method,
-        scanned=found.scanned, explanation=found.agreement.sentence(), agreement=_plain(found.agreement),
+        scanned=found.scanned, explanation=found.agreement.sentence(),
+        agreement=dataclasses.asdict(found.agreement) | dict(outliers=outliers),
         calibration={name: np.asarray(value).tolist() for name, value in found.calibration.items()},
     )  # fmt: skip
     if (known := found.evidence) is not None:

@@ -637,7 +637,7 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
         ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), method="lm")
     with pytest.raises(ValueError, match="low < high"):
         ltl.Bounded(1.0, 1.0)
-    with pytest.raises(ValueError, match="has but one"):
+    with pytest.raises(ValueError, match="has only one"):
         ltl.fit(lambda p: p * bumpy(sphere), 1.0, ltl.Observations(bumpy(sphere), species=0))
     with pytest.raises(ValueError, match=r"inf at index \(0, 1\)"):
         ltl.fit_many(

@@ -3,20 +3,22 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 from scipy.spatial import KDTree
 
-from .observations import Observations, root_of_deviance
+from .observations import Observations
 
 # Fewer than this many pure-noise values per fit are expected to count as outliers.
 _FALSE_OUTLIERS = 0.05
 # Residuals count as structured from this correlation of neighbours on, if it is also this many standard deviations
 # away from what independent noise gives.
 _CORRELATED, _SIGNIFICANT = 0.05, 4.0
-# From this share of the values on, outliers are no outliers.
+# If more than this share of the values are outliers, the model is wrong rather than the values.
 _MANY = 0.25
+# Variance of a standard deviation over that of one estimated from the median; the other constant turns the median of
+# absolute values into the standard deviation of a normal distribution.
+_EFFICIENCY, _NORMAL_OVER_MEDIAN = 2.7, 1.4826
 # Residuals below this share of the data's spread, or of a known noise, are too small for their structure to matter.
 _NEGLIGIBLE, _WELL_BELOW = 1e-3, 0.5
 # Residuals are clipped at so many standard deviations before correlations are taken, so that outliers do not decide.
@@ -59,16 +61,20 @@ class Agreement:
         expected: interval that holds the reduced chi square with a probability of 95 % if model and noise are right.
         explained: share of the variance of the data that the model explains, of the values that are no outliers; 0
             for a model that is no better than the mean, negative for a worse one.
-        in_space: correlation of residuals over the surface; None where the data have no places, or too few.
-        in_time: correlation of residuals from one time to the next; None where there is but one time.
+        is_negligible: whether the residuals are too small for a pattern in them to matter.
+        in_space: correlation of residuals over the surface; None where the data have no places, or the residuals are
+            negligible.
+        in_time: correlation of residuals from one time to the next; None where there is one time only, or the residuals
+            are negligible.
         outliers: indices (K, values.ndim) of values too far from the model to be noise, the farthest first.
-        outlier_limit: residual, in standard deviations, from which on a value counts as an outlier.
+        outlier_limit: smallest residual, in standard deviations, of an outlier.
         num_values: number of values that were measured.
     """
 
     reduced_chi_square: float
     expected: tuple[float, float]
     explained: float
+    is_negligible: bool
     in_space: Correlation | None
     in_time: Correlation | None
     outliers: np.ndarray
@@ -82,13 +88,15 @@ class Agreement:
 
     @property
     def has_many_outliers(self) -> bool:
-        """Whether so many values are outliers that it is rather the model that is wrong."""
+        """Whether so many values are outliers that the model must be wrong, and not the values."""
         return len(self.outliers) > _MANY * self.num_values
 
     @property
     def is_structured(self) -> bool:
         """Whether the residuals follow a pattern in space or in time, which noise does not."""
-        return any(found is not None and found.is_structure for found in (self.in_space, self.in_time))
+        return any(
+            correlation is not None and correlation.is_structure for correlation in (self.in_space, self.in_time)
+        )
 
     @property
     def is_useless(self) -> bool:
@@ -104,10 +112,10 @@ class Agreement:
         else:
             size = f"{100 * self.explained:.4g} % of the variance is explained"
         patterns = [
-            f"residuals of neighbours in {where} correlate by {found.value:.2f}, which noise does not "
-            f"({found.deviations:.0f} standard deviations)"
-            for where, found in (("space", self.in_space), ("time", self.in_time))
-            if found is not None and found.is_structure
+            f"residuals of neighbours in {where} correlate by {correlation.value:.2f}, which noise does not "
+            f"({correlation.deviations:.0f} standard deviations)"
+            for where, correlation in (("space", self.in_space), ("time", self.in_time))
+            if correlation is not None and correlation.is_structure
         ]
         if self.is_useless:
             return "The model explains nothing: the mean of the data is closer to them than the model."
@@ -115,67 +123,99 @@ class Agreement:
             patterns.append(f"{len(self.outliers)} of {self.num_values} values are too far from the model to be noise")
         if self.is_unexplained or patterns:
             return f"The model does not explain the data: {'; '.join([size, *patterns])}."
-        return f"The model explains the data: {size}, and the residuals show no structure."
+        if not np.isfinite(self.reduced_chi_square) and self.explained < _WORSE:
+            return f"The model explains the data no better than their mean does: {size}."
+        rest = "and the residuals show no structure"
+        if self.is_negligible:
+            rest = "and the residuals are negligible"
+        elif self.in_space is None and self.in_time is None:
+            rest = "but nothing tells whether the residuals have structure"
+        if self.reduced_chi_square > self.expected[1]:
+            return f"The model explains the data, though not to the last: {size}, {rest}."
+        return f"The model explains the data: {size}, {rest}."
 
 
-def agreement(data: Observations, misfit: np.ndarray, free: float, surface: Any = None) -> Agreement:
+def agreement(
+    data: Observations, misfit: np.ndarray, free: float, scales: np.ndarray, num_unknowns: int, surface: Any = None
+) -> Agreement:
     """How well a model agrees with its data.
 
     Args:
         data: the data.
         misfit: residuals in units of the noise where it is known, in the shape of the values.
-        free: degrees of freedom: number of values less those that the parameters take.
+        free: degrees of freedom: number of values less those that the parameters take; NaN where they are not known.
+        scales: standard deviation of the noise in units of the noise given, where it grows with the signal.
+        num_unknowns: number of unknowns of the fit.
         surface: surface that carries the field; None where there is none.
     """
     mask = np.asarray(data.mask)
-    is_known = data.knows_noise
-    spread = np.ones(()) if is_known else data.median_spread(np.where(mask, misfit, 0))
+    is_known, rates = data.knows_noise, None
+    if data.is_count:
+        # Pearson's residuals, whose squares have a mean of one however low the rates are.
+        rates = np.maximum(data.predicted(np.where(mask, misfit, 0), np.ones(())), np.finfo(np.float64).tiny)
+        misfit = np.where(mask, (rates - np.asarray(data.values, np.float64)) / np.sqrt(rates), np.nan)
+    spread = np.ones(()) if is_known else data.median_spread(np.where(mask, misfit, 0), num_unknowns)
     residuals = np.where(mask, misfit / np.broadcast_to(spread, misfit.shape), np.nan)
     size = int(mask.sum())
-    limit = float(stats.norm.isf(0.5 * _FALSE_OUTLIERS / size))
-    far = np.argwhere(np.nan_to_num(np.abs(residuals)) > limit)
+    # Where the noise is estimated, quotients by it have Student's distribution.
+    tail = stats.norm if is_known else stats.t(max(size - num_unknowns, 1) / _EFFICIENCY)
+    limit = float(tail.isf(0.5 * _FALSE_OUTLIERS / size))
+    is_far = np.nan_to_num(np.abs(residuals)) > limit
+    if rates is not None:
+        # Counts of low rates have longer tails than a normal distribution.
+        counts = np.asarray(data.values, np.float64)
+        chance = np.minimum(stats.poisson.sf(counts - 1, rates), stats.poisson.cdf(counts, rates))
+        is_far &= chance < 0.5 * _FALSE_OUTLIERS / size
+    far = np.argwhere(is_far)
     if len(far):
         far = far[np.argsort(-np.abs(residuals[tuple(far.T)]))]
     chi_square, expected = float("nan"), (float("nan"), float("nan"))
-    good = mask & ~(np.nan_to_num(np.abs(residuals)) > limit)
+    good = mask & ~is_far
     if data.loss.is_robust:
         free -= len(far)
     if is_known and free >= 1:
         counted = good if data.loss.is_robust else mask
         chi_square = float(np.sum(np.where(counted, misfit, 0) ** 2) / free)
-        expected = (float(stats.chi2.ppf(0.025, free) / free), float(stats.chi2.ppf(0.975, free) / free))
-    explained = explained_share(data, misfit, good)
-    typical = float(np.sqrt(np.nanmedian(residuals**2)))
-    is_small = chi_square < _WELL_BELOW**2 if is_known else 1 - explained < _NEGLIGIBLE**2
+        expected = _expected(free, None if rates is None else rates[counted])
+    explained = explained_share(data, misfit, good, scales)
+    typical = _NORMAL_OVER_MEDIAN * float(np.sqrt(np.nanmedian(residuals**2)))
+    is_small = bool(chi_square < _WELL_BELOW**2 if is_known else 1 - explained < _NEGLIGIBLE**2)
     clipped = np.clip(residuals, -_CLIPPED * typical, _CLIPPED * typical) if typical > 0 else residuals
     in_space = in_time = None
     if not is_small:
         in_space = None if surface is None else _in_space(data, clipped, surface)
         in_time = None if data.times is None or len(data.times) < 2 else _correlation(clipped[:-1], clipped[1:])
-    return Agreement(chi_square, expected, explained, in_space, in_time, far, limit, size)
+    return Agreement(chi_square, expected, explained, is_small, in_space, in_time, far, limit, size)
 
 
-def explained_share(data: Observations, misfit: np.ndarray, mask: np.ndarray) -> float:
+def _expected(free: float, rates: np.ndarray | None) -> tuple[float, float]:
+    """The interval that holds a reduced chi square with 95 %: of normal noise, or of counts with such rates."""
+    if rates is None:
+        return float(stats.chi2.ppf(0.025, free) / free), float(stats.chi2.ppf(0.975, free) / free)
+    # A squared Pearson residual of a count with the rate l has the variance 2 + 1 / l.
+    reach = float(stats.norm.ppf(0.975) * np.sqrt(np.sum(2 + 1 / rates)) / free)
+    return max(1 - reach, 0.0), 1 + reach
+
+
+def explained_share(data: Observations, misfit: np.ndarray, mask: np.ndarray, scales: np.ndarray) -> float:
     """The share of the variance about the mean that a model explains, in units of the noise: the mean over species.
 
     Args:
         data: the data.
         misfit: residuals in units of the noise where it is known, in the shape of the values.
         mask: which of them count.
+        scales: standard deviation of the noise in units of the noise given.
     """
     values = np.asarray(data.values, np.float64)
-    noise = np.broadcast_to(1.0 if data.noise is None else np.asarray(data.noise, np.float64), values.shape)
+    noise = scales * (1.0 if data.noise is None else np.asarray(data.noise, np.float64))
+    noise = np.broadcast_to(noise, values.shape)
     shares = []
     for column in data.columns:
         seen, weight = values[column][mask[column]], 1 / noise[column][mask[column]] ** 2
         if not seen.size:
             continue
         mean = np.average(seen, weights=weight)
-        if data.is_count:
-            rates = jnp.full(seen.shape, mean, data.values.dtype)
-            off = np.asarray(root_of_deviance(jnp.asarray(seen, rates.dtype), rates), np.float64)
-        else:
-            off = (seen - mean) * np.sqrt(weight)
+        off = (seen - mean) / np.sqrt(mean or 1.0) if data.is_count else (seen - mean) * np.sqrt(weight)
         if (spread := np.sum(off**2)) > 0:
             shares.append(1 - np.sum(misfit[column][mask[column]] ** 2) / spread)
     return float(np.mean(shares)) if shares else 1.0

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..mesh.arguments import as_numbers
-from .unknowns import Real, Transform, start_of
+from .unknowns import Bounded, Real, Transform, start_of
 
 
 class Calibration(eqx.Module):
@@ -16,7 +16,7 @@ class Calibration(eqx.Module):
 
     Attributes:
         scale: factor between the field and the data: known, or the `Transform` of an unknown one.
-        offset: constant that the data have beside it, likewise.
+        offset: constant that is added, likewise.
         background: known pattern of which the data hold an unknown amount; None for none.
         shape: shape of each unknown: () or the number of species.
     """
@@ -32,15 +32,15 @@ class Calibration(eqx.Module):
         Args:
             size: typical size of the data.
         """
-        found: dict[str, tuple[np.ndarray, Transform, float]] = {}
+        unknown: dict[str, tuple[np.ndarray, Transform, float]] = {}
         for name, value, default, typical in (("scale", self.scale, 1.0, 1.0), ("offset", self.offset, 0.0, size)):
             if isinstance(value, Transform):
-                start = start_of(value, default)
-                found[name] = np.full(self.shape, start), value, max(abs(start), typical)
+                start = start_of(value, _inside(value, default))
+                unknown[name] = np.full(self.shape, start), value, max(abs(start), typical)
         if self.background is not None:
             strength = float(np.sqrt(np.mean(np.asarray(self.background, np.float64) ** 2)))
-            found["background"] = np.zeros(self.shape), Real(), size / strength
-        return found
+            unknown["background"] = np.zeros(self.shape), Real(), size / strength
+        return unknown
 
     def __call__(self, seen: Array, unknown: dict[str, Array]) -> Array:
         """The measured values of a field's values, given the unknowns by name."""
@@ -72,7 +72,7 @@ class Calibration(eqx.Module):
             terms["background"] = np.broadcast_to(np.asarray(self.background, seen.dtype), seen.shape)
         given = {name: getattr(self, name) for name in ("scale", "offset") if name not in unknown}
         known = {name: np.broadcast_to(np.asarray(value), self.shape) for name, value in given.items()}
-        found = {name: start.copy() for name, (start, _, _) in unknown.items()}
+        solved = {name: start.copy() for name, (start, _, _) in unknown.items()}
         for index in np.ndindex(self.shape):
             column = (..., *index)
             rows = mask[column]
@@ -81,8 +81,8 @@ class Calibration(eqx.Module):
             columns = np.stack([terms[name][column][rows] for name in unknown], axis=-1)
             for name, value in zip(unknown, np.linalg.lstsq(columns, rest)[0], strict=True):
                 if unknown[name][1].admits(value):
-                    found[name][index] = value
-        return found
+                    solved[name][index] = value
+        return solved
 
 
 def calibration(scale: Any, offset: Any, background: Any, shape: tuple[int, ...], data: tuple[int, ...]) -> Calibration:
@@ -101,7 +101,7 @@ def calibration(scale: Any, offset: Any, background: Any, shape: tuple[int, ...]
     chosen: dict[str, Any] = {}
     for name, value, default in (("scale", scale, 1.0), ("offset", offset, 0.0)):
         if isinstance(value, Transform):
-            start = np.asarray(start_of(value, default), np.float64)
+            start = np.asarray(start_of(value, _inside(value, default)), np.float64)
             if not value.admits(start):
                 raise ValueError(f"Expected the start of {name} to be {value}, found {start:g}.")
             chosen[name] = value
@@ -122,6 +122,13 @@ def calibration(scale: Any, offset: Any, background: Any, shape: tuple[int, ...]
             f"found the shape {pattern.shape}."
         )
     return Calibration(chosen["scale"], chosen["offset"], jnp.asarray(pattern, jnp.result_type(float)), shape)
+
+
+def _inside(transform: Transform, default: float) -> float:
+    """The default; the middle of the range where that is bounded and does not hold it."""
+    if isinstance(transform, Bounded) and not transform.admits(np.asarray(default)):
+        return 0.5 * (transform.low + transform.high)
+    return default
 
 
 def broadcasts(shape: tuple[int, ...], to: tuple[int, ...]) -> bool:

@@ -65,11 +65,12 @@ class Checkpoint:
         self.space = space
         return space, jnp.asarray(kept["unknowns"], scales[0].dtype), float(kept["loss"]), kept["spread"]
 
-    def refuse_other(self, loss: float, left: float) -> None:
+    def refuse_other(self, loss: float, left: float, spread: np.ndarray) -> None:
         """Raise where the model gives another loss than the one that was left."""
         here, there = np.sqrt(2 * loss), np.sqrt(2 * left)
-        noise = 1.0 if self.data.noise is None else np.asarray(self.data.noise)
-        size = np.linalg.norm(np.asarray(self.data.values) / noise)
+        values = np.asarray(self.data.values, np.float64)
+        noise = spread * (1.0 if self.data.noise is None else np.asarray(self.data.noise, np.float64))
+        size = np.linalg.norm(np.sqrt(values) if self.data.is_count else values / noise)
         if not abs(here - there) <= _SAME * (there + size):
             raise RestartError(
                 f"{self.path} holds another fit: its loss was {left:.6g} where this model's is {loss:.6g}. {_ANEW}"

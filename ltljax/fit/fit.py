@@ -18,7 +18,7 @@ from .observations import Experiment, Observations
 from .problem import Model, Problem, Program, Residuals, jacobian_of, prepare, steps_adaptively, values_of
 from .report import Evidence, evidence
 from .report import summary as _summary
-from .scan import explains_nothing, scan
+from .scan import better_start, explains_nothing
 from .search import End, FitError, search
 from .unknowns import unknowns
 
@@ -34,18 +34,20 @@ class Fit:
     Attributes:
         params: the parameters, as the start was given.
         calibration: what was unknown about the measurement: scale, offset and amount of background, by name.
-        losses: (steps,) half the sum of squared residuals after every step, the start's first; where the spread of the
-            residuals is taken from the data, after every step with the last spread.
+        losses: (steps,) half the sum of squared residuals after every step, the first step being the start. Where the
+            spread of the residuals is taken from the data, these are the steps with the last spread.
         reason: why it stopped, in words.
         has_settled: whether it stopped because the parameters or the loss no longer changed, or no step lowers the
             loss.
-        num_steps: of the method, rejected ones with them: each a run of the model, with derivatives in a least-squares
-            method, and in others where it was accepted.
+        num_steps: number of steps of the method, including rejected ones. Each is a run of the model; a least-squares
+            method takes derivatives in every step, other methods in accepted ones.
         method: the method, and how derivatives were taken.
-        residuals: (prediction - value) / noise of every value; NaN where nothing was measured.
+        residuals: (prediction - value) / noise of every value, in the unit of the data where the noise was not given;
+            of counts the signed root of the deviance. NaN where nothing was measured.
         evidence: covariance, intervals, and what the data cannot tell; None with many unknowns.
         agreement: whether the model explains the data: size and structure of the residuals, outliers.
         scanned: what was done about a start that explains nothing, in words; empty where it explains something.
+        penalties: sum of the squared residuals of the penalty, in the unit of the loss.
     """
 
     params: Any
@@ -59,6 +61,7 @@ class Fit:
     evidence: Evidence | None
     agreement: Agreement
     scanned: str
+    penalties: float
     _problem: Problem = dataclasses.field(repr=False)
     _program: Program = dataclasses.field(repr=False)
     _z: Array = dataclasses.field(repr=False)
@@ -68,7 +71,7 @@ class Fit:
         """What became of the fit, in one of these words or phrases:
 
         - ``"converged"``: it has settled, the model explains the data, and they determine every parameter;
-        - ``"explains nothing"``: it has settled where the mean of the data would be as good a model;
+        - ``"explains nothing"``: it has settled where the mean of the data would be a better model;
         - ``"end of range"``: it has settled with a parameter at the end of its range;
         - ``"unexplained"``: it has settled, and the residuals are much larger than the noise;
         - ``"structured residuals"``: it has settled, and the residuals are no noise: neighbours agree;
@@ -132,9 +135,13 @@ class Fit:
         """What the model gives with the parameters found."""
         return self._problem.residuals.predicted(self._z)
 
-    def summary(self) -> str:
-        """A table of the parameters with intervals, and in words how well the data tell them."""
-        return _summary(self, self.data)
+    def summary(self, vertex_numbers: np.ndarray | None = None) -> str:
+        """Whether the model explains the data, a table of the parameters with intervals, and how well they are known.
+
+        Args:
+            vertex_numbers: (V,) numbers by which vertices are called; by default those of the mesh.
+        """
+        return _summary(self, self.data, vertex_numbers)
 
     def __str__(self) -> str:
         return self.summary()
@@ -188,8 +195,9 @@ def fit(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     confidence: float = 0.95,
+    scan: bool = True,
 ) -> Fit:
-    """The parameters of a model that explain data best, in the sense of least squares (host).
+    """The parameters of a model that explain data best, in the sense of least squares or of a robust loss (host).
 
     With up to 64 unknowns the method is Levenberg-Marquardt on the residuals; their Jacobian is taken in forward mode
     along with the run (`diffrax.ForwardMode`), or row by row of a model that has reverse mode alone and up to 64
@@ -215,6 +223,8 @@ def fit(
         checkpoint: a file (.npz) in which to keep the parameters as the fit goes.
         resume: whether to begin with what ``checkpoint`` holds, whatever the start.
         confidence: of the intervals.
+        scan: whether a start that explains nothing is replaced by the best of 96 points around it, with up to 64
+            unknowns.
 
     Returns:
         The `Fit`.
@@ -226,8 +236,7 @@ def fit(
         OutputError: ``checkpoint`` names a file that ltljax did not write.
         FitError: the model fails at the start.
     """
-    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64)[np.asarray(data.mask)] ** 2))) or 1.0
-    calibration = data.calibration.unknowns(typical)
+    calibration = data.calibration.unknowns(data.typical_size)
     space = unknowns(start, transforms, calibration)
     z = space.free((start, {name: guess for name, (guess, *_) in calibration.items()}))
     left = spread = None
@@ -240,7 +249,7 @@ def fit(
     residuals = problem.program if spread is None else problem.program.with_spread(jnp.asarray(spread, z.dtype))
     function, (value, misfit) = problem.function(residuals, z)
     scanned = ""
-    if left is None and explains_nothing(problem.residuals, np.asarray(misfit)):
+    if scan and left is None and explains_nothing(problem.residuals, np.asarray(misfit)):
         z, scanned = _scanned(problem.residuals, z)
         function, (value, misfit) = problem.function(residuals, z)
     # Infinite derivatives make the factor zero.
@@ -256,7 +265,7 @@ def fit(
     def after(step: int, loss: float, z: Array) -> bool:
         if keeper is not None:
             if step == 0 and left is not None and not num_steps:
-                keeper.refuse_other(loss, left)
+                keeper.refuse_other(loss, left, np.asarray(residuals.arrays.spread, np.float64))
             keeper.keep(z, loss, np.asarray(residuals.arrays.spread))
         return stop_when is not None and bool(stop_when(num_steps + step, loss, space.params(z)))
 
@@ -264,16 +273,21 @@ def fit(
         return max(0.0 if data.noise is None else 0.5, loss / data.num_values)
 
     num_steps, end = 0, End(z, [], "", False)
-    for _ in range(_ROUNDS):
+    for round_ in range(_ROUNDS):
         steps = range(max_steps - num_steps)
         steps = watched("fit", unit="step")(steps) if progress else steps
         end = search(problem.solver, function, z, steps, unit, after)
         z, num_steps = end.z, num_steps + len(end.losses)
-        if not (data.has_moving_spread and end.has_settled and num_steps < max_steps):
+        if not data.has_moving_spread:
             break
-        residuals, change = _respread(data, residuals, values_of(residuals, z)[1])
+        changed, change = _respread(data, residuals, values_of(residuals, z)[1])
         if change < _AGREED:
             break
+        if not end.has_settled or num_steps >= max_steps or round_ == _ROUNDS - 1:
+            reason = "the size of the residuals, which is taken from the data, has not settled"
+            end = dataclasses.replace(end, has_settled=False, reason=reason if end.has_settled else end.reason)
+            break
+        residuals = changed
         function = dataclasses.replace(function, residuals=residuals)
     return _found(problem, residuals, end, num_steps, scanned, confidence)
 
@@ -281,18 +295,18 @@ def fit(
 def _respread(data: Observations, residuals: Program, misfit: Array) -> tuple[Program, float]:
     """The residuals with the spread that the misfit shows, and by what share it differs from the one before."""
     before = np.asarray(residuals.arrays.spread, np.float64)
-    spread = data.spread(np.asarray(misfit), before)
+    spread = data.spread(np.asarray(misfit), before, residuals.num_unknowns)
     change = float(np.max(np.abs(np.log(spread / before))))
     return residuals.with_spread(jnp.asarray(spread, residuals.arrays.spread.dtype)), change
 
 
 def _scanned(residuals: Any, z: Array) -> tuple[Array, str]:
     """A better start than the first guess, and what was done to find it, in words."""
-    found = scan(residuals, np.asarray(z))
-    if found is None:
+    better = better_start(residuals, np.asarray(z))
+    if better is None:
         return z, "The start explains nothing, and no point within a factor of 1000 of it that was tried explains more."
-    better, count = found
-    z = jnp.asarray(better, z.dtype)
+    start, count = better
+    z = jnp.asarray(start, z.dtype)
     values = jax.tree.leaves(residuals.space.params(z))
     flat = np.concatenate([np.ravel(np.asarray(leaf)) for leaf in values])
     words = ", ".join(f"{name} = {value:.3g}" for name, value in zip(residuals.space.names, flat, strict=False))
@@ -304,7 +318,7 @@ def _found(
 ) -> Fit:  # fmt: skip
     data, space, z = problem.data, problem.space, end.z
     spread = np.asarray(residuals.arrays.spread, np.float64)
-    known, free = None, float(data.num_values)
+    known, free = None, float("nan")
     reason, has_settled = end.reason, end.has_settled
     if z.size <= MANY and problem.is_least_squares:
         (value, misfit), jacobian = jacobian_of(residuals, z, problem.reverse)
@@ -316,16 +330,18 @@ def _found(
             reason += "; derivatives are not finite there, so that nothing is known of errors"
             has_settled = False
     else:
-        _, misfit = values_of(residuals, z)
+        value, misfit = values_of(residuals, z)
     shape = data.values.shape
     # Where the noise was not given, residuals are in the unit of the data.
     factor = spread if data.estimates_spread else 1.0
     misfit = np.where(np.asarray(data.mask), np.asarray(misfit, np.float64).reshape(shape) * factor, np.nan)
+    penalties = float(np.sum(np.asarray(value)[data.values.size :] ** 2))
     model = problem.residuals.model
     surface = model.surface if isinstance(model, Experiment) and model.vertices is None else None
-    agreed = agreement(data, misfit, free, surface)
+    scales = np.ones(()) if data.estimates_spread else spread
+    agreed = agreement(data, misfit, free, scales, z.size, surface)
     params, calibration = space.values(z)
     return Fit(
         params, calibration, np.array(end.losses), reason, has_settled, num_steps, problem.method, misfit, known,
-        agreed, scanned, problem, residuals, z,
+        agreed, scanned, penalties, problem, residuals, z,
     )  # fmt: skip

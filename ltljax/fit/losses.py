@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Below this share of the square of its scale, a loss is taken to be proportional to the squared residual: formulas such
-# as sqrt(1 + z) - 1 lose their digits there.
-_SMALL = 1e-7
+# A loss is taken to be proportional to the squared residual z below this power of the rounding: formulas such as
+# sqrt(1 + z) - 1 lose their digits there.
+_SMALL = 0.45
 
 
 def _linear(z: Array) -> Array:
@@ -64,7 +64,7 @@ class Loss(eqx.Module):
         if not self.is_robust:
             return r
         z = (r / self.scale) ** 2
-        safe = jnp.maximum(z, _SMALL)
+        safe = jnp.maximum(z, float(jnp.finfo(z.dtype).eps) ** _SMALL)
         return r * jnp.sqrt(self.rho(safe) / safe)
 
     def influence(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +78,7 @@ def as_loss(loss: Any) -> Loss:
     """The loss of a name or a function.
 
     Raises:
-        ValueError: there is no such loss, or the function is none: it is not finite, does not begin at zero, or falls.
+        ValueError: there is no such loss, or the function cannot be one: it is not finite, not zero at zero, or falls.
     """
     if isinstance(loss, Loss):
         return loss

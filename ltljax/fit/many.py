@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .observations import Observations, refuse_infinite
 from .problem import FitResiduals, Model, Residuals, forward_adjoint, prepare
+from .scan import distance_to
 from .unknowns import unknowns
 
 
@@ -22,7 +23,7 @@ class ManyFits(eqx.Module):
         params: the parameters, with the fits along a new first axis.
         losses: (N,) of each; infinite where the model fails at the start.
         num_steps: (N,).
-        converged: (N,).
+        converged: (N,) whether each has settled; whether the model explains the data is not asked here.
         calibration: unknown scale, offset and background of the data, by name, with the fits along a new first axis.
     """
 
@@ -68,6 +69,8 @@ def fit_many(
     Raises:
         ValueError: as of `fit`, or the first axes do not fit.
     """
+    is_given = ~np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else True
+    values = values.filled(0) if isinstance(values, np.ma.MaskedArray) else values
     many = None if values is None else jnp.asarray(values, data.values.dtype)
     if many is not None and many.shape[1:] != data.values.shape:
         raise ValueError(f"Expected values of shape (N, *{data.values.shape}), found {many.shape}.")
@@ -79,8 +82,13 @@ def fit_many(
     measured = None
     if many is not None:
         refuse_infinite(np.asarray(many))
-        measured = ~jnp.isnan(many) & data.mask[None]
+        measured = ~jnp.isnan(many) & data.mask[None] & jnp.asarray(np.broadcast_to(is_given, many.shape))
         many = jnp.where(measured, many, 0)
+        counts = np.asarray(measured).reshape(len(many), -1).sum(axis=1)
+        if not counts.all():
+            raise ValueError(f"Data set {int(np.argmin(counts))} has no value that was measured. Leave it out.")
+        if data.is_count and bool(jnp.any(many < 0)):
+            raise ValueError('Expected counts from 0 with noise="poisson", found a negative value.')
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(starts)]
     shapes = {leaf.shape[:1] for leaf in leaves}
     if values is None and (len(shapes) != 1 or shapes == {()}):
@@ -90,7 +98,7 @@ def fit_many(
     each = (
         [starts] if rows is None else [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], starts) for k in range(rows)]
     )
-    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64) ** 2))) or 1.0
+    typical = data.typical_size if many is None else float(np.sqrt(np.mean(np.asarray(many, np.float64) ** 2))) or 1.0
     calibration = data.calibration.unknowns(typical)
     guesses = {name: guess for name, (guess, *_) in calibration.items()}
     space, *_ = [unknowns(start, transforms, calibration) for start in each]
@@ -162,6 +170,8 @@ def explore(
 
     Returns:
         The guesses, along a first axis of every leaf, the best first; and their losses, infinite where the model fails.
+        Where a scale, an offset or the noise of a robust loss is unknown, these are mean distances from the data
+        instead, after scale and offset are set to their best values.
 
     Raises:
         ValueError: a range is empty, or data and model do not go together.
@@ -179,8 +189,7 @@ def explore(
     in_log = (least > 0) & logarithmic
     safe = np.where(in_log, least, 1.0), np.where(in_log, most, 1.0)
     points = np.where(in_log, safe[0] * (safe[1] / safe[0]) ** share, least + (most - least) * share)
-    typical = float(np.sqrt(np.mean(np.asarray(data.values, np.float64) ** 2))) or 1.0
-    calibration = data.calibration.unknowns(typical)
+    calibration = data.calibration.unknowns(data.typical_size)
     guesses = {name: jnp.asarray(guess) for name, (guess, *_) in calibration.items()}
     space = unknowns(rebuild(jnp.asarray(points[0])), None, calibration)
     spread = jnp.ones(data.spread_shape, jnp.result_type(float))
@@ -188,13 +197,21 @@ def explore(
     free = jax.vmap(lambda point: space.free((rebuild(point), guesses)))
     z = np.asarray(free(jnp.asarray(points, jnp.result_type(float))))
     data.check(eqx.filter_eval_shape(lambda z: residuals.predicted(z), z[0]))
-    converted = eqx.filter_closure_convert(lambda z: residuals(z), jnp.asarray(z[0]))
-    several = eqx.filter_jit(lambda c, z: jax.vmap(lambda z: 0.5 * jnp.sum(c(z) ** 2))(z))
+    # Of unknown scales and noise each point would need its own: then points are compared by their distance instead.
+    seen = lambda z: data.of(residuals.predicted(z))  # noqa: E731
+    converted = eqx.filter_closure_convert(
+        seen if calibration or data.has_moving_spread else residuals, jnp.asarray(z[0])
+    )
+    by_distance = bool(calibration) or data.has_moving_spread
+    several = eqx.filter_jit(lambda c, z: jax.vmap(lambda z: c(z) if by_distance else 0.5 * jnp.sum(c(z) ** 2))(z))
     batch = min(batch, count)
     losses = np.empty(count)
     for begin in range(0, count, batch):
         # The last batch reaches back, so that all have one shape.
         begin = min(begin, count - batch)
-        losses[begin : begin + batch] = np.asarray(several(converted, jnp.asarray(z[begin : begin + batch])))
+        values = np.asarray(several(converted, jnp.asarray(z[begin : begin + batch])), np.float64)
+        if by_distance:
+            values = [distance_to(data, value) if np.isfinite(value).all() else np.inf for value in values]
+        losses[begin : begin + batch] = values
     best = np.argsort(losses)[:keep]
     return jax.vmap(rebuild)(jnp.asarray(points[best])), losses[best]

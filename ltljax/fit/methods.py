@@ -61,10 +61,10 @@ class Counted(optx.AbstractSearch):
 class Marquardt(optx.LevenbergMarquardt):
     """Levenberg-Marquardt that does not take a step made short by damping for the end.
 
-    Where the data tell one direction a thousand times better than another, damping that suits the first holds the
-    second: steps become short far from the minimum. So this asks the step of Gauss and Newton. Where steps are short,
-    or lead nowhere, the minimum is reached if that is short too, or is to lower the loss by no more than `SETTLED`; if
-    not damping falls. Elsewhere it is reached if both hold.
+    If the data determine one direction a thousand times better than another, damping that suits the first holds back
+    the second, and steps become short far from the minimum. So short steps, and rejected ones, are compared with the
+    step that Gauss and Newton would take. If that is short as well, or would lower the loss by no more than `SETTLED`,
+    the minimum is reached; otherwise damping is reduced. Where steps are long, both must hold.
 
     No step changes an unknown by more than ``reach``. A run far from all parameters that make sense may take thousands
     of times as long as any other, only for its step to be rejected.

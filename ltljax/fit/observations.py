@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.special import lambertw
 
 from ..equations import Equation
 from ..mesh.arguments import as_numbers, positive
@@ -42,6 +43,7 @@ class Observations(eqx.Module):
     Attributes:
         values: (T, N, S) at T times, N places and S species; without an axis where the model has none: (T, N) of a
             scalar equation, (N, S) of a stationary state, any shape of a statistic. Zero where nothing was measured.
+            The last of two axes without times, and of three with times, counts as that of species.
         mask: which values were measured, in the shape of the values.
         noise: standard deviation of the noise where the signal is zero, a number or anything that broadcasts to the
             values; None where it is not known, and for counts.
@@ -117,7 +119,7 @@ class Observations(eqx.Module):
         self.mask = jnp.asarray(_measured(host, mask, is_given))
         self.values = jnp.where(self.mask, jnp.asarray(host), 0)
         self.is_count = isinstance(noise, str) and noise == "poisson"
-        self.noise = None if noise is None or self.is_count else _noise(noise, host.shape, dtype)
+        self.noise = None if noise is None or self.is_count else _noise(noise, np.asarray(self.mask), dtype)
         if self.is_count and bool(jnp.any(self.values < 0)):
             raise ValueError('Expected counts from 0 with noise="poisson", found a negative value.')
         self.relative_noise = None
@@ -149,6 +151,11 @@ class Observations(eqx.Module):
     def num_values(self) -> int:
         """Number of values that were measured."""
         return int(np.sum(np.asarray(self.mask)))
+
+    @property
+    def typical_size(self) -> float:
+        """Root mean square of the values that were measured; 1 where all are zero."""
+        return float(np.sqrt(np.mean(np.asarray(self.values, np.float64)[np.asarray(self.mask)] ** 2))) or 1.0
 
     @property
     def has_species(self) -> bool:
@@ -209,14 +216,14 @@ class Observations(eqx.Module):
         if self.vertices is not None and len(shape) > axis and (self.vertices >= shape[axis]).any():
             raise ValueError(f"Vertex {self.vertices.max()} was observed; the model has {shape[axis]} vertices.")
         if self.species is not None and len(shape) <= axis + 1:
-            raise ValueError(f"Species {max(self.species)} was observed; the model has but one: leave species= out.")
+            raise ValueError(f"Species {max(self.species)} was observed; the model has only one: leave species= out.")
         if self.species is not None and max(self.species) >= shape[axis + 1]:
             raise ValueError(f"Species {max(self.species)} was observed; the model has {shape[axis + 1]} species.")
-        found = jax.eval_shape(lambda prediction: self.of(prediction), prediction).shape
-        if found != self.values.shape:
+        predicted = jax.eval_shape(lambda prediction: self.of(prediction), prediction).shape
+        if predicted != self.values.shape:
             raise ValueError(
-                f"The model predicts an array of shape {found} for observations of shape {self.values.shape}: expected "
-                "(times, vertices, species), or what the model returns, with the same vertices and species."
+                f"The model predicts an array of shape {predicted} for observations of shape {self.values.shape}. "
+                "Expected (times, vertices, species), or what the model returns, with the same vertices and species."
             )
 
     def misfit(
@@ -233,12 +240,31 @@ class Observations(eqx.Module):
         """
         seen = self.of(prediction, calibration)
         if self.is_count:
-            return jnp.ravel(jnp.where(self.mask, root_of_deviance(self.values, seen), 0))
+            # A safe rate where nothing was measured: derivatives of infinite roots would be NaN there.
+            rates = jnp.where(self.mask, seen, 1)
+            return jnp.ravel(jnp.where(self.mask, root_of_deviance(self.values, rates), 0))
         noise = jnp.broadcast_to(1.0 if self.noise is None else self.noise, seen.shape)
         spread = jnp.broadcast_to(jnp.asarray(spread, seen.dtype), seen.shape)
         return jnp.ravel(jnp.where(self.mask, (seen - self.values) / (noise * spread), 0))
 
-    def spread(self, misfit: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    def predicted(self, misfit: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        """What the model predicts for the values, from their misfit (host).
+
+        Args:
+            misfit: misfit in the shape of the values.
+            spread: spread that it was computed with.
+        """
+        values = np.asarray(self.values, np.float64)
+        if not self.is_count:
+            noise = np.broadcast_to(1.0 if self.noise is None else np.asarray(self.noise, np.float64), values.shape)
+            return values + misfit * noise * spread
+        # With the deviance d = r^2 / 2 of a count n the rate solves rate / n - 1 - log(rate / n) = d / n.
+        safe = np.where(values > 0, values, 1)
+        inner = -np.exp(-1 - misfit**2 / (2 * safe))
+        above, below = (-safe * np.real(lambertw(inner, branch)) for branch in (-1, 0))
+        return np.where(values > 0, np.where(misfit > 0, above, below), misfit**2 / 2)
+
+    def spread(self, misfit: np.ndarray, spread: np.ndarray, num_unknowns: int) -> np.ndarray:
         """Standard deviation of the misfit in units of the noise, to be used by `misfit` (host).
 
         It follows the prediction where the noise grows with the signal. With a robust loss and unknown noise it is
@@ -248,6 +274,7 @@ class Observations(eqx.Module):
         Args:
             misfit: (M,) misfit with a spread that was used before.
             spread: that spread.
+            num_unknowns: number of unknowns of the fit.
         """
         values = np.asarray(self.values, np.float64)
         residuals = np.reshape(np.asarray(misfit, np.float64), values.shape) * spread
@@ -256,19 +283,25 @@ class Observations(eqx.Module):
             return np.sqrt(1 + (float(self.relative_noise) * (values / noise + residuals)) ** 2)
         if not self.estimates_spread:
             return np.ones(())
-        return self.median_spread(residuals)
+        return self.median_spread(residuals, num_unknowns)
 
-    def median_spread(self, residuals: np.ndarray) -> np.ndarray:
-        """The standard deviation () or (S,) of residuals in the shape of the values, from their median (host)."""
-        values, mask = np.asarray(self.values, np.float64), np.asarray(self.mask)
-        # Residuals of data without noise are nothing but rounding.
-        least = 10 * float(jnp.finfo(self.values.dtype).eps) * np.sqrt(np.mean(values[mask] ** 2))
-        least = max(least, float(jnp.finfo(self.values.dtype).tiny))
+    def median_spread(self, residuals: np.ndarray, num_unknowns: int) -> np.ndarray:
+        """The standard deviation () or (S,) of residuals in the shape of the values, from their median (host).
+
+        The smallest residuals are left out, as many as there are unknowns, which may fit that many values exactly; and
+        those that are nothing but rounding.
+        """
+        mask = np.asarray(self.mask)
+        noise = np.broadcast_to(1.0 if self.noise is None else np.asarray(self.noise, np.float64), mask.shape)
+        size = np.sqrt(np.mean((np.asarray(self.values, np.float64) / noise)[mask] ** 2))
+        least = max(10 * float(jnp.finfo(self.values.dtype).eps) * size, float(jnp.finfo(self.values.dtype).tiny))
         sizes = []
         for column in self.columns:
-            off = np.abs(residuals[column][mask[column]])
-            sizes.append(max(_NORMAL_OVER_MEDIAN * np.median(off), least) if off.size else 1.0)
-        return np.reshape(np.array(sizes), values.shape[-1:] if self.has_species else ())
+            off = np.sort(np.abs(residuals[column][mask[column]]))
+            off = off[min(round(num_unknowns * off.size / self.num_values), max(off.size - 1, 0)) :]
+            off = off[off > least]
+            sizes.append(_NORMAL_OVER_MEDIAN * np.median(off) if off.size else least)
+        return np.reshape(np.array(sizes), mask.shape[-1:] if self.has_species else ())
 
     @property
     def spread_shape(self) -> tuple[int, ...]:
@@ -307,14 +340,18 @@ def _measured(values: np.ndarray, mask: Any, is_given: Any) -> np.ndarray:
     return counts
 
 
-def _noise(noise: Any, shape: tuple[int, ...], dtype: Any) -> Array:
+def _noise(noise: Any, mask: np.ndarray, dtype: Any) -> Array:
     """The standard deviation of the noise, checked."""
     if isinstance(noise, str):
         raise ValueError(f'Expected noise as a number, an array or "poisson", found {noise!r}.')
-    levels = jnp.asarray(as_numbers("noise", noise), dtype)
+    shape, levels = mask.shape, jnp.asarray(as_numbers("noise", noise), dtype)
+    fits = broadcasts(levels.shape, shape)
+    if fits and levels.ndim:
+        # It does not matter where nothing was measured.
+        levels = jnp.where(jnp.asarray(mask), jnp.broadcast_to(levels, shape), 1)
     if not bool(jnp.all(jnp.isfinite(levels) & (levels > 0))):
         raise ValueError("Expected a positive noise level; for values without noise leave it out.")
-    if not broadcasts(levels.shape, shape):
+    if not fits:
         raise ValueError(
             f"A noise of shape {levels.shape} does not fit values {shape}: expected one number, or a shape that "
             "broadcasts to the values'."
@@ -337,11 +374,14 @@ def _vertices(vertices: Any) -> tuple[int | None, np.ndarray | None]:
 
 
 def root_of_deviance(counts: Array, rates: Array) -> Array:
-    """The signed root of 2 (rate - count + count log(count / rate)); NaN where a rate is not positive.
+    """The signed root of 2 (rate - count + count log(count / rate)); NaN where a rate is not positive, but for a count
+    and a rate of zero.
 
     McCullagh and Nelder 1989, Generalized Linear Models, section 2.3.
     """
     is_seen = counts > 0
+    is_rate = (rates > 0) | ((rates == 0) & ~is_seen)
+    rates = jnp.where(rates > 0, rates, jnp.where(is_rate, jnp.finfo(rates.dtype).tiny, 1))
     off = rates / jnp.where(is_seen, counts, 1) - 1
     is_near = jnp.abs(off) < 0.05
     # 2 (off - log(1 + off)) / off^2, which loses its digits next to zero, by its power series there.
@@ -349,8 +389,8 @@ def root_of_deviance(counts: Array, rates: Array) -> Array:
     far = jnp.where(is_near, 1.0, off)
     ratio = jnp.where(is_near, series, 2 * (far - jnp.log1p(far)) / far**2)
     some = jnp.sqrt(jnp.where(is_seen, counts, 1)) * off * jnp.sqrt(ratio)
-    none = jnp.sqrt(2 * jnp.where(rates > 0, rates, 1.0))
-    return jnp.where(rates > 0, jnp.where(is_seen, some, none), jnp.nan)
+    none = jnp.sqrt(2 * rates)
+    return jnp.where(is_rate, jnp.where(is_seen, some, none), jnp.nan)
 
 
 def refuse_infinite(values: np.ndarray) -> None:

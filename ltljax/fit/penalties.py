@@ -98,9 +98,9 @@ def choose_weight(
         if rule == "discrepancy" and not found.data.knows_noise:
             raise ValueError("The discrepancy principle needs the noise: give Observations(..., noise=...).")
         start = found.params
-        misfit = float(np.nansum(found.residuals**2))
+        misfit = 2 * found.loss - found.penalties
         fits.append(found)
-        curve.append((weight, misfit, max(2 * found.loss - misfit, 0.0)))
+        curve.append((weight, misfit, found.penalties))
         if rule == "discrepancy" and misfit <= found.data.num_values:
             break
     table = np.array(curve)

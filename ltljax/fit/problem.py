@@ -2,8 +2,8 @@
 
 import collections
 import dataclasses
-import hashlib
 import inspect
+import threading
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -16,6 +16,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from ..solve.fingerprint import fingerprint, read_from_modules
 from .methods import MANY, method_of
 from .observations import Experiment, Observations
 from .unknowns import Unknowns
@@ -88,6 +89,11 @@ class Program(eqx.Module):
     def __call__(self, z: Array) -> Array:
         """The residuals."""
         return self.both(z)[0]
+
+    @property
+    def num_unknowns(self) -> int:
+        """Number of unknowns."""
+        return len(self.arrays.space.names)
 
     def with_spread(self, spread: Array) -> "Program":
         """The same with another spread of the misfit."""
@@ -266,15 +272,15 @@ def prepare(
     solver, name = method_of(method, z.size, rtol, atol, space.reach)
     is_least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     key = _key(plain, z, is_least_squares)
-    if key is None or key not in _TRACED:
+    with _LOCK:
+        traced = _TRACED.pop(key, None)
+    if traced is None:
         traced = _traced(plain, z, is_least_squares)
-        if key is not None:
-            _TRACED[key] = *traced, (model, penalty)
-        while len(_TRACED) > _KEPT:
-            _TRACED.popitem(last=False)
-    else:
-        traced = _TRACED[key][:-1]
-        _TRACED.move_to_end(key)
+    if key is not None:
+        with _LOCK:
+            _TRACED[key] = traced
+            while len(_TRACED) > _KEPT:
+                _TRACED.popitem(last=False)
     run, adjoint, reverse, num_residuals, how = traced
     num_values = num_residuals - data.values.size + data.num_values
     if num_values < z.size:
@@ -297,8 +303,8 @@ def _without_model(residuals: FitResiduals) -> FitResiduals:
     return dataclasses.replace(residuals, model=None, penalty=None, adjoint=None)
 
 
-# Each with the model and the penalty whose arrays its key names by their identity, so that they live as long.
-_TRACED: collections.OrderedDict[Hashable, tuple[Any, Any, bool, int, str, Any]] = collections.OrderedDict()
+_LOCK = threading.Lock()
+_TRACED: collections.OrderedDict[Hashable, tuple[Any, Any, bool, int, str]] = collections.OrderedDict()
 
 
 def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any, Any, bool, int, str]:
@@ -332,23 +338,18 @@ def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any,
 
 
 def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
-    """What the program of the residuals depends on beside data, unknowns and spread; None where that cannot be told.
+    """What the program of the residuals depends on beside the numbers of data, unknowns and spread; None where that
+    cannot be told.
 
-    Functions and the arrays of a model count as the same if they are the same object, as functions do for `jax.jit`.
+    Model and penalty count by their arrays, by the source of their functions, and by the values that these read from
+    the functions and modules around them, so that a changed value is seen.
     """
-
-    def fixed(leaf: Any) -> Hashable:
-        if is_on_device(leaf):
-            return id(leaf)
-        if isinstance(leaf, np.ndarray):
-            return leaf.shape, leaf.dtype.str, hashlib.sha256(leaf.tobytes()).digest()
-        return type(leaf), leaf
-
     arrays, rest = eqx.partition(_without_model(plain), is_on_device)
     shapes = tuple((leaf.shape, str(leaf.dtype), bool(leaf.weak_type)) for leaf in jax.tree.leaves(arrays))
-    leaves, structure = jax.tree.flatten((rest, plain.model, plain.penalty, plain.adjoint))
-    key = shapes, tuple(map(fixed, leaves)), structure, z.shape, str(z.dtype), is_least_squares
+    leaves, structure = jax.tree.flatten(rest)
     try:
+        own = plain.model, plain.penalty, leaves
+        key = shapes, structure, fingerprint((*own, read_from_modules(own))), z.shape, str(z.dtype), is_least_squares
         hash(key)
     except TypeError:
         return None

@@ -88,6 +88,8 @@ def evidence(
 
     r, j = np.asarray(residuals, np.float64), np.asarray(jacobian, np.float64)
     size, num_values = j.shape[1], data.values.size
+    if data.is_count and not data.loss.is_robust:
+        j = np.concatenate([_of_pearson(data, np.asarray(misfit, np.float64), j[:num_values]), j[num_values:]])
     is_known = data.knows_noise or data.estimates_spread
     u, s, vt = np.linalg.svd(j, full_matrices=False)
     safe = np.maximum(s, np.finfo(np.float64).eps * (s[0] or 1.0))
@@ -100,14 +102,16 @@ def evidence(
         in_z = _sandwich(data, np.asarray(misfit, np.float64), j, free)
         noise = float(np.sqrt(np.mean(spread**2)))
         if data.knows_noise:
-            noise = float(data.median_spread(np.reshape(np.asarray(misfit), data.values.shape)).mean())
+            noise = float(data.median_spread(np.reshape(np.asarray(misfit), data.values.shape), size).mean())
     else:
         in_z = (vt.T / safe**2) @ vt * sigma**2
-        if not is_known and data.has_species and np.isfinite(sigma):
-            left = vt.T / safe**2 @ vt
-            variances = _variances(data, r[:num_values], taken, sigma**2)
-            weights = np.concatenate([variances, np.full(len(r) - num_values, sigma**2)])
-            in_z = left @ ((j * weights[:, None]).T @ j) @ left
+    deviations = np.full(num_values, sigma)
+    if not is_known and data.has_species and np.isfinite(sigma):
+        inverse = vt.T / safe**2 @ vt
+        variances = _variances(data, r[:num_values], taken, sigma**2)
+        weights = np.concatenate([variances, np.full(len(r) - num_values, sigma**2)])
+        in_z = inverse @ ((j * weights[:, None]).T @ j) @ inverse
+        deviations = np.sqrt(np.maximum(variances, np.finfo(np.float64).tiny))
     values_there = space.values(z)
     slopes = np.asarray(space.slopes(z), np.float64)
     std_z = np.sqrt(np.diag(in_z))
@@ -115,7 +119,8 @@ def evidence(
     reach = float(quantile(0.5 + confidence / 2)) * std_z
     ends = [space.values(z + jnp.asarray(side * reach, z.dtype)) for side in (-1, 1)]
     values = _flat(values_there)
-    # Where a step of Gauss and Newton in the parameters themselves leads: in a minimum nowhere, at a bound beyond it.
+    # Where a step of Gauss and Newton in the parameters themselves would lead. In a minimum it changes nothing; at the
+    # end of a range it leads beyond.
     at_end = space.at_end(values_there, values - slopes * ((vt.T / safe) @ (u.T @ r)))
     # Relative changes; of parameters near zero changes by the scale of the start.
     leaves = jax.tree.leaves(values_there)
@@ -124,7 +129,11 @@ def evidence(
     relative = j[:num_values] * (sizes / np.where(slopes == 0, 1.0, slopes))
     _, singular, directions = np.linalg.svd(relative, full_matrices=num_values < size)
     singular = np.concatenate([singular, np.zeros(size - len(singular))])
-    level = _level(data, spread)
+    # In units of the noise of each value.
+    known = np.where(np.isfinite(deviations) & (deviations > 0), deviations, 1.0)
+    _, in_noise, told = np.linalg.svd(relative / known[:, None], full_matrices=num_values < size)
+    in_noise = np.concatenate([in_noise, np.zeros(size - len(in_noise))])
+    level = _level(data, spread * known.reshape(data.values.shape))
     rounding = float(np.sqrt(jnp.finfo(jacobian.dtype).eps))
     said = [
         f"{name} has run to the end of its range, {value:.4g}: the data would have it there or beyond, and its "
@@ -132,14 +141,14 @@ def evidence(
         for name, value, ended in zip(space.names, values, at_end, strict=True)
         if ended
     ]
-    for value, direction in zip(singular, directions, strict=True):
+    for value, direction in zip(in_noise, told, strict=True):
         if np.abs(direction[at_end]).max(initial=0.0) > _VAGUE:
             continue
-        is_vague, share = sigma > _VAGUE * value, value / level
+        is_vague, share = np.isfinite(sigma) and _VAGUE * value < 1, value / level
         if share < rounding or (is_vague and adaptive and share < _UNSEEN):
             said.append(_sentence(space.names, direction, share, "tell", "not seen at all"))
         elif is_vague:
-            said.append(_sentence(space.names, direction, share, "tell", f"known to {100 * sigma / value:.0f} % only"))
+            said.append(_sentence(space.names, direction, share, "tell", f"known to {100 / value:.0f} % only"))
         elif adaptive and share < _UNSEEN:
             less = "less than the errors that adaptive steps may have: tighten rtol and atol, or give dt="
             said.append(_sentence(space.names, direction, share, "safely tell", less))
@@ -147,6 +156,21 @@ def evidence(
         space.names, values, slopes[:, None] * in_z * slopes, slopes * std_z, (ends[0][0], ends[1][0]),
         np.array([_flat(end) for end in ends]), at_end, confidence, singular, directions, noise, free, tuple(said),
     )  # fmt: skip
+
+
+def _of_pearson(data: Observations, misfit: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """The Jacobian (M, n) of Pearson's residuals of counts, whose square is Fisher's information.
+
+    The root r of the deviance has the derivative (1 - n / l) / r with respect to the rate l of a count n; that of
+    Pearson's residual, with the variance held, is l^-1/2.
+    """
+    counts = np.ravel(np.asarray(data.values, np.float64))
+    rates = np.ravel(data.predicted(misfit.reshape(data.values.shape), np.ones(())))
+    rates = np.maximum(rates, np.finfo(np.float64).tiny)
+    far = np.abs(misfit) > 1e-6
+    slopes = np.where(far, (1 - counts / rates) / np.where(far, misfit, 1), 1 / np.sqrt(rates))
+    scale = 1 / (np.sqrt(rates) * np.where(slopes > 0, slopes, np.inf))
+    return jacobian * np.where(np.ravel(np.asarray(data.mask)), scale, 0)[:, None]
 
 
 def _sandwich(data: Observations, misfit: np.ndarray, jacobian: np.ndarray, free: float) -> np.ndarray:
@@ -175,12 +199,12 @@ def _sandwich(data: Observations, misfit: np.ndarray, jacobian: np.ndarray, free
 def _variances(data: Observations, residuals: np.ndarray, taken: np.ndarray, all_of_them: float) -> np.ndarray:
     """(M,) variance of the residuals of each value's species; of all together where that species leaves too few."""
     shape, mask = data.values.shape, np.asarray(data.mask)
-    found = np.full(shape, all_of_them)
+    variances = np.full(shape, all_of_them)
     for column in data.columns:
         free = np.sum(mask[column]) - np.sum(taken.reshape(shape)[column])
         if free > 1:
-            found[column] = np.sum(residuals.reshape(shape)[column] ** 2) / free
-    return found.ravel()
+            variances[column] = np.sum(residuals.reshape(shape)[column] ** 2) / free
+    return variances.ravel()
 
 
 def _level(data: Observations, spread: np.ndarray) -> float:
@@ -214,14 +238,14 @@ def _sentence(names: tuple[str, ...], direction: np.ndarray, share: float, verb:
     )
 
 
-def summary(fit: Any, data: Observations) -> str:
+def summary(fit: Any, data: Observations, vertex_numbers: np.ndarray | None = None) -> str:
     """The table of a fit, and in words whether the model explains the data and how well its parameters are known."""
     lines = [fit.agreement.sentence()]
     if fit.scanned:
         lines.append(fit.scanned)
     lines.append(
-        f"{fit.method}: {fit.num_steps} steps, {fit.num_runs} runs of the model, loss {fit.loss:.4g}; {fit.status}, "
-        f"because {fit.reason}."
+        f"{fit.method}: {fit.num_steps} steps, {fit.num_runs} runs of the model, loss {fit.loss:.4g}. "
+        f"Status: {fit.status}; the search ended because {fit.reason}."
     )
     known = fit.evidence
     if known is None:
@@ -231,7 +255,7 @@ def summary(fit: Any, data: Observations) -> str:
             f"{np.max(leaf):.4g}"
             for path, leaf in leaves
         ]
-        return "\n".join([*lines, *_outliers(fit, data)])
+        return "\n".join([*lines, *_outliers(fit, data, vertex_numbers)])
     width = max(9, *(len(name) for name in known.names))
     lines.append(f"  {'parameter':{width}} {'value':>12} {'std':>10}   {100 * known.confidence:.0f} % interval")
     lines += [
@@ -242,7 +266,7 @@ def summary(fit: Any, data: Observations) -> str:
         unit = "residuals over noise (1 if model and noise are right)" if data.knows_noise else "estimated noise"
         lines.append(f"{unit}: {known.noise:.3g}")
     lines.append("singular values: " + ", ".join(f"{value:.3g}" for value in known.singular_values))
-    lines += _outliers(fit, data)
+    lines += _outliers(fit, data, vertex_numbers)
     lines += _advice(fit, data)
     if not data.knows_noise and not np.isfinite(known.noise):
         lines.append(
@@ -270,22 +294,25 @@ def _advice(fit: Any, data: Observations) -> list[str]:
     ]
 
 
-def _outliers(fit: Any, data: Observations) -> list[str]:
+def _outliers(fit: Any, data: Observations, vertex_numbers: np.ndarray | None) -> list[str]:
     """How many values are outliers, where the farthest are, and what they do."""
-    found = fit.agreement.outliers
-    if not len(found) or fit.agreement.has_many_outliers:
+    outliers = fit.agreement.outliers
+    if not len(outliers) or fit.agreement.has_many_outliers:
         return []
-    named = "; ".join(_place(data, index) for index in found[:_NAMED])
-    more = f"; and {len(found) - _NAMED} more (fit.agreement.outliers)" if len(found) > _NAMED else ""
-    what = "count less" if data.loss.is_robust else 'count in full: loss="huber" limits what they can do'
-    are = "1 value is an outlier" if len(found) == 1 else f"{len(found)} of {data.num_values} values are outliers"
+    named = "; ".join(_place(data, index, vertex_numbers) for index in outliers[:_NAMED])
+    more = f"; and {len(outliers) - _NAMED} more (fit.agreement.outliers)" if len(outliers) > _NAMED else ""
+    what = "They count less than others." if data.loss.is_robust else 'They count in full: loss="huber" limits that.'
+    are = (
+        f"1 of {data.num_values} values is an outlier"
+        if len(outliers) == 1
+        else (f"{len(outliers)} of {data.num_values} values are outliers")
+    )
     return [
-        f"{are}, more than {fit.agreement.outlier_limit:.1f} standard deviations from the model, and {what}: "
-        f"{named}{more}."
+        f"{are}, more than {fit.agreement.outlier_limit:.1f} standard deviations from the model: {named}{more}. {what}"
     ]
 
 
-def _place(data: Observations, index: np.ndarray) -> str:
+def _place(data: Observations, index: np.ndarray, vertex_numbers: np.ndarray | None) -> str:
     """Where and when a value was measured, and the value."""
     parts, axis = [], 0
     if data.times is not None:
@@ -294,6 +321,8 @@ def _place(data: Observations, index: np.ndarray) -> str:
     if len(index) > axis:
         kind = "vertex" if data.sampling is None else "place"
         place = index[axis] if data.vertices is None else data.vertices[index[axis]]
+        if data.sampling is None and vertex_numbers is not None:
+            place = vertex_numbers[place]
         parts.append(f"{kind} {place}")
     if data.has_species and data.values.shape[-1] > 1:
         column = index[-1] if data.species is None else data.species[index[-1]]

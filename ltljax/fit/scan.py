@@ -9,16 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from .observations import Experiment, root_of_deviance
+from .methods import MANY
+from .observations import Experiment
 from .problem import FitResiduals
 from .unknowns import Bounded, Positive
 
 # Factors are scanned over so many decades each way; points of the first pass and of the second, closer to the best.
 _DECADES, _POINTS, _CLOSER = 3.0, 64, 32
+# Points of the first pass at most that change one parameter alone.
+_ALONE = 30
 # Half the width of the second pass, in decades.
 _NARROW = 0.5
-# An adaptive run of more steps counts as failed while the scan looks for a start; if that leaves no point, of more than
-# the second number.
+# An adaptive run counts as failed in the scan if it takes more steps than the first number. If no point is better than
+# the first guess then, the scan is repeated with the second number.
 _MOST_STEPS = 250, 3000
 # A guess may explain something if it is off by less than this share of the size of the data.
 _SHARE = 0.5
@@ -35,23 +38,19 @@ def explains_nothing(residuals: FitResiduals, misfit: np.ndarray) -> bool:
         misfit: (M,) misfit at the first guess.
     """
     data = residuals.data
-    if data.num_values < _FEW or not (isinstance(residuals.model, Experiment) or data.times is not None):
+    is_run = isinstance(residuals.model, Experiment) or data.times is not None
+    if not is_run or len(residuals.space.names) > MANY or data.num_values < _FEW:
         return False
-    mask, values = np.asarray(data.mask), np.asarray(data.values, np.float64)
+    values = np.asarray(data.values, np.float64)
     misfit = np.reshape(np.asarray(misfit, np.float64), values.shape)
     if not np.isfinite(misfit).all():
         return True
-    if data.is_count:
-        rates = jnp.full(values.shape, values[mask].mean(), data.values.dtype)
-        null = jnp.where(data.mask, root_of_deviance(data.values, rates), 0)
-        return bool(np.sum(misfit**2) > np.sum(np.asarray(null) ** 2) > 0)
-    noise = np.broadcast_to(1.0 if data.noise is None else np.asarray(data.noise, np.float64), values.shape)
-    measured = values + misfit * noise * np.asarray(residuals.spread)
-    size = _distance(data, np.zeros(values.shape))
-    return bool(_distance(data, measured) > max(_distance(data, _means(data)), _SHARE * size) > 0)
+    measured = data.predicted(misfit, np.asarray(residuals.spread, np.float64))
+    size = distance_to(data, np.zeros(values.shape))
+    return bool(distance_to(data, measured) > max(distance_to(data, _means(data)), _SHARE * size) > 0)
 
 
-def scan(residuals: FitResiduals, z: np.ndarray) -> tuple[np.ndarray, int] | None:
+def better_start(residuals: FitResiduals, z: np.ndarray) -> tuple[np.ndarray, int] | None:
     """A better vector of unknowns than a first guess, and the number of runs it took; None where none was found.
 
     Positive parameters are multiplied by factors from 1/1000 to 1000: one at a time, all together, and at the points
@@ -63,8 +62,8 @@ def scan(residuals: FitResiduals, z: np.ndarray) -> tuple[np.ndarray, int] | Non
         return _scan(residuals, z)
     for most in _MOST_STEPS:
         model = dataclasses.replace(residuals.model, max_steps=min(residuals.model.max_steps, most))
-        if (found := _scan(dataclasses.replace(residuals, model=model), z)) is not None:
-            return found
+        if (better := _scan(dataclasses.replace(residuals, model=model), z)) is not None:
+            return better
     return None
 
 
@@ -75,7 +74,7 @@ def _scan(residuals: FitResiduals, z: np.ndarray) -> tuple[np.ndarray, int] | No
 
     def distance(point: np.ndarray) -> float:
         measured = np.asarray(_called(seen, jnp.asarray(point, z.dtype)), np.float64)
-        return _distance(residuals.data, measured) if np.isfinite(measured).all() else np.inf
+        return distance_to(residuals.data, measured) if np.isfinite(measured).all() else np.inf
 
     chance = qmc.Sobol(size, rng=0)
     best, least = z, distance(z)
@@ -99,6 +98,7 @@ def _points(size: int, chance: np.ndarray) -> np.ndarray:
     """Decades (N, size) to go from the first guess: all parameters together, one at a time, and at random."""
     together = [np.full(size, x) for x in np.arange(-_DECADES, _DECADES + 0.25, 0.5) if x]
     alone = [x * row for row in np.eye(size) for x in (-1, 1, -2, 2, -3, 3)]
+    alone = [alone[k] for k in np.unique(np.linspace(0, len(alone) - 1, _ALONE).astype(int))]
     return np.array([*together, *alone, *(_DECADES * (2 * chance - 1))])[: len(chance)]
 
 
@@ -112,15 +112,16 @@ def _moved(residuals: FitResiduals, z: np.ndarray, decades: np.ndarray) -> np.nd
         if isinstance(transform, Positive):
             moved[part] = z[part] + np.log(10) * decades[part]
         elif isinstance(transform, Bounded):
-            share = np.clip(0.5 + decades[part] / (2 * _DECADES), 0.01, 0.99)
-            moved[part] = np.log(share / (1 - share))
+            share = 1 / (1 + np.exp(-z[part])) + decades[part] / (2 * _DECADES)
+            share = np.clip(share, 0.01, 0.99)
+            moved[part] = np.where(decades[part] == 0, z[part], np.log(share / (1 - share)))
         else:
             moved[part] = z[part] * 10 ** decades[part]
         begin += leaf.size
     return moved
 
 
-def _distance(data: Any, measured: np.ndarray) -> float:
+def distance_to(data: Any, measured: np.ndarray) -> float:
     """The mean distance of data from a prediction, after unknown scales and offsets are set to their best values, in
     units of each species' spread."""
     values, mask = np.asarray(data.values, np.float64), np.asarray(data.mask)

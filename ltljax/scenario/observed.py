@@ -172,9 +172,9 @@ def _places(
     columns: dict[str, np.ndarray], mesh: Mesh, patches: np.ndarray | None, factor: float, table: Table
 ) -> tuple[Places, np.ndarray]:
     """Where the rows of a file were measured, and the row of the data that each of its rows becomes."""
-    here = columns.pop("vertex", None)
-    if here is not None:
-        return Places(_vertices(here, mesh, table)), np.arange(len(here))
+    numbers_of_vertices = columns.pop("vertex", None)
+    if numbers_of_vertices is not None:
+        return Places(_vertices(numbers_of_vertices, mesh, table)), np.arange(len(numbers_of_vertices))
     if patches is not None:
         numbers, count = columns.pop("patch", None), int(patches.max()) + 1
         if numbers is None or not np.array_equal(np.sort(numbers), np.arange(count)):
@@ -186,15 +186,15 @@ def _places(
     return Places(), np.asarray(mesh.source_order)
 
 
-def _vertices(here: np.ndarray, mesh: Mesh, table: Table) -> np.ndarray:
+def _vertices(numbers: np.ndarray, mesh: Mesh, table: Table) -> np.ndarray:
     """Vertices of the mesh, from their numbers in its file."""
-    found = here.astype(np.int64)
-    if (found != here).any() or len(np.unique(found)) != len(found):
+    vertices = numbers.astype(np.int64)
+    if (vertices != numbers).any() or len(np.unique(vertices)) != len(vertices):
         raise table.error("file", "whole numbers as its column vertex, each once,")
-    if (found < 0).any() or (found >= mesh.num_vertices).any():
-        bad = found[(found < 0) | (found >= mesh.num_vertices)][0]
+    if (vertices < 0).any() or (vertices >= mesh.num_vertices).any():
+        bad = vertices[(vertices < 0) | (vertices >= mesh.num_vertices)][0]
         raise table.error("file", f"vertices from 0 to {mesh.num_vertices - 1}, not {bad},")
-    return np.asarray(mesh.source_order)[found]
+    return np.asarray(mesh.source_order)[vertices]
 
 
 def _columns(path: Path, table: Table, key: str = "file") -> dict[str, np.ndarray]:

@@ -32,6 +32,45 @@ def fingerprint(value: Any) -> str:
     return digest.hexdigest()[:16]
 
 
+def read_from_modules(value: Any) -> dict[str, Any]:
+    """The values that the functions in a value read from the modules they are written in, by module and name.
+
+    Functions are looked for in pytrees, in closures, and among the values that other functions read. Those of
+    installed packages count as constant.
+
+    Args:
+        value: a pytree, or a function.
+    """
+    values: dict[str, Any] = {}
+    waiting, seen = list(jax.tree.leaves(value)), set()
+    while waiting:
+        function = inspect.unwrap(waiting.pop()) if callable(waiting[-1]) else waiting.pop()
+        if isinstance(function, functools.partial):
+            waiting += [function.func, *jax.tree.leaves((function.args, function.keywords))]
+        if isinstance(function, types.MethodType):
+            waiting += [function.__func__, function.__self__]
+        if not isinstance(function, types.FunctionType) or id(function) in seen or _is_installed(function):
+            continue
+        seen.add(id(function))
+        waiting += jax.tree.leaves(list(_enclosed(function).values()))
+        for name in _names(function.__code__):
+            if name in function.__globals__ and not isinstance(function.__globals__[name], types.ModuleType | type):
+                values[f"{function.__module__}.{name}"] = function.__globals__[name]
+                waiting += jax.tree.leaves(function.__globals__[name])
+    return values
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """The names that code and the functions within it may read from their module."""
+    inner = [part for part in code.co_consts if isinstance(part, types.CodeType)]
+    return set(code.co_names).union(*map(_names, inner))
+
+
+def _is_installed(function: types.FunctionType) -> bool:
+    file = function.__code__.co_filename
+    return "site-packages" in file or (function.__module__ or "").split(".")[0] == "ltljax"
+
+
 def _feed(update: Callable[[bytes], None], value: Any, within: list[int]) -> None:
     """Feed a value into a digest.
 
