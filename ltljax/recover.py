@@ -17,7 +17,7 @@ from .fit import Experiment, Fit, Observations, Positive, Real, fit, observe_at,
 from .folder import Folder
 from .lifting.schemes import Scheme
 from .progress import noted
-from .scenario import Scenario, ScenarioError, Wanted
+from .scenario import Places, Scenario, ScenarioError, Wanted
 from .solve.restart import RestartError
 from .surface import FarFromOriginWarning, Surface
 
@@ -107,6 +107,8 @@ def _observations(wanted: Wanted, surface: Surface) -> Observations:
     places = wanted.places
     if places.points is not None:
         options["operator"] = observe_at(surface, places.points)
+    elif places.operator is not None:
+        options["operator"] = places.operator
     elif places.patches is not None:
         options["operator"] = observe_patches(surface, places.patches)
     else:
@@ -116,7 +118,7 @@ def _observations(wanted: Wanted, surface: Surface) -> Observations:
 
 def _rows(wanted: Wanted, found: Fit, numbers: np.ndarray) -> list[dict[str, Any]]:
     """The outliers by time, by the row of their file, from 0, and by species."""
-    is_whole = wanted.places.vertices is None and wanted.places.points is None and wanted.places.patches is None
+    is_whole = wanted.places.is_same(Places())
     return [
         dict(
             time=float(wanted.times[when]),

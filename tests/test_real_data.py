@@ -694,8 +694,9 @@ def off(values, chance):
         ("scale = true\noffset = 0", "vertices", as_is),
         ("noise = 0.01\nrelative_noise = 0.001", "points", as_is),
         ('patches = "patches.csv"', "patches", as_is),
+        ('operator = "weights.npz"\nbackground = "dark.csv"', "sums", as_is),
     ],
-    ids=["calibration", "points", "patches"],
+    ids=["calibration", "points", "patches", "operator and background"],
 )
 def test_a_scenario_file_fits_data_as_they_are_measured(tmp_path, options, where, spoil):
     from ltljax import scenario
@@ -714,6 +715,13 @@ def test_a_scenario_file_fits_data_as_they_are_measured(tmp_path, options, where
         states = np.asarray(ltl.observe_patches(surface, numbers)(states, axis=1))
         (tmp_path / "patches.csv").write_text("patch\n" + "\n".join(map(str, numbers[order])) + "\n")
         in_files(tmp_path, dict(patch=np.arange(16)), states, spoil)
+    elif where == "sums":
+        weights = np.random.default_rng(3).normal(size=(150, surface.num_vertices))
+        np.savez(tmp_path / "weights.npz", weights=weights[:, order])
+        dark = 1 + np.arange(150) % 3
+        head = "u,v\n" + "\n".join(f"{x},{x}" for x in dark) + "\n"
+        (tmp_path / "dark.csv").write_text(head)
+        in_files(tmp_path, {}, np.einsum("nv,tvs->tns", weights, states) + 0.2 * dark[:, None], spoil)
     else:
         in_files(tmp_path, {}, states[:, order], spoil)
     (tmp_path / "mine.toml").write_text(text)
@@ -741,6 +749,27 @@ def test_new_fit_prints_a_scenario_that_is_fitted(tmp_path, capsys):
     assert main(["fit", str(tmp_path / "my.toml"), "--out", str(tmp_path / "out"), "--set", "kinetics.a=0.2"]) == 0
     assert json.loads((tmp_path / "out" / "fit.json").read_text())["status"] == "converged"
     assert (tmp_path / "out" / "fit.png").exists()
+
+
+def test_the_picture_shows_where_the_loss_is_not_quadratic():
+    plt = pytest.importorskip("matplotlib.pyplot")
+    early = np.linspace(0, 0.5, 12)
+    model = lambda p: p["size"] * (1 - jnp.exp(-p["rate"] * early))  # noqa: E731
+    values = 2 * (1 - np.exp(-early)) + 0.03 * np.random.default_rng(1).normal(size=12)
+    fit = ltl.fit(model, dict(size=2.0, rate=1.0), ltl.Observations(values, 0.03), transforms=ltl.Positive())
+    steps = np.array([-2.0, 0.0, 2.0])
+    rise = fit.losses_along("rate", steps) - fit.loss
+    assert rise[1] == pytest.approx(0, abs=1e-9)
+    assert np.abs(rise[[0, 2]] / 2 - 1).max() > 0.5
+    figure = fit.plot()
+    assert "not quadratic" in [axes.get_title() for axes in figure.axes]
+    plt.close(figure)
+    linear = ltl.fit(lambda p: p * jnp.asarray(early), 1.0, ltl.Observations(early, 0.1))
+    np.testing.assert_allclose(
+        linear.losses_along("parameter", steps) - linear.loss, steps**2 / 2, rtol=1e-6, atol=1e-9
+    )
+    with pytest.raises(ValueError, match="There is no parameter 'b'"):
+        linear.losses_along("b", steps)
 
 
 def test_the_picture_of_a_fit_shows_outliers(experiment, exact):

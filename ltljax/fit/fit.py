@@ -159,6 +159,34 @@ class Fit:
         known = model.surface if isinstance(model, Experiment) else None
         return picture(self, self.data, known if surface is None else surface)
 
+    def losses_along(self, name: str, deviations: Any) -> np.ndarray:
+        """The loss where one parameter is moved by some of its standard deviations, and the others follow it as their
+        covariance says. It is the profile where the loss is quadratic, and an upper bound of the profile elsewhere.
+
+        Args:
+            name: name of the parameter, as in the table.
+            deviations: (P,) multiples of the standard deviation, in the free unknowns.
+
+        Returns:
+            (P,) losses, each from one run of the model; infinite where it fails.
+
+        Raises:
+            ValueError: there is no such parameter, or nothing is known of its error.
+        """
+        known, space = self.evidence, self._problem.space
+        if name not in space.names:
+            raise ValueError(f"There is no parameter {name!r}; there are {', '.join(space.names)}.")
+        index = space.names.index(name)
+        if known is None or not 0 < known.std[index] < np.inf:
+            raise ValueError(f"Nothing is known of the error of {name}.")
+        slopes = np.asarray(space.slopes(self._z), np.float64)
+        direction = known.covariance[:, index] / (slopes * known.std[index])
+        points = [self._z + jnp.asarray(step * direction, self._z.dtype) for step in np.asarray(deviations, np.float64)]
+        # With the derivatives, which are not needed, since that program is compiled.
+        runs = [jacobian_of(self._program, z, self._problem.reverse)[0][0] for z in points]
+        losses = np.array([0.5 * float(jnp.sum(residuals**2)) for residuals in runs])
+        return np.where(np.isfinite(losses), losses, np.inf)
+
     def profile(self, name: str, values: Any, max_steps: int = 30) -> np.ndarray:
         """The least loss with one parameter held at each of some values: its profile likelihood.
 

@@ -11,6 +11,8 @@ from .observations import Observations
 _PAIRS = 3
 # Points drawn at most of data against model.
 _POINTS = 4000
+# The loss is compared with a parabola so many standard deviations from the minimum; the share by which it may differ.
+_REACH, _BENT = 2.0, 0.5
 # Intervals drawn at most, and the largest end that is drawn, as a multiple of the value.
 _INTERVALS, _WIDEST = 12, 3.0
 
@@ -31,7 +33,8 @@ def picture(fit: Any, data: Observations, surface: Any = None, observed: np.ndar
     pairs = [] if known is None else _strongest(known.covariance)
     axis = 0 if data.times is None else 1
     has_places = surface is not None and data.values.ndim > axis and data.values.shape[axis] > 1
-    count = 2 + (known is not None) + len(pairs)
+    bent = [] if known is None else _not_quadratic(fit)
+    count = 2 + (known is not None) + len(pairs) + len(bent)
     figure = plt.figure(figsize=(3.6 * max(count, 2), 7.2 if has_places else 3.6), layout="constrained")
     figure.suptitle(textwrap.fill(fit.agreement.sentence(), 36 * max(count, 2)), fontsize="medium")
     grid = figure.add_gridspec(2 if has_places else 1, count)
@@ -44,6 +47,8 @@ def picture(fit: Any, data: Observations, surface: Any = None, observed: np.ndar
         _intervals(figure.add_subplot(grid[0, 2]), known)
     for k, pair in enumerate(pairs):
         _ellipse(figure.add_subplot(grid[0, 3 + k]), known, pair)
+    for k, name in enumerate(bent):
+        _profile(figure.add_subplot(grid[0, 3 + len(pairs) + k]), fit, name)
     if has_places:
         _on_surface(figure.add_subplot(grid[1, :]), fit, data, predicted, surface)
     return figure
@@ -102,6 +107,32 @@ def _ellipse(axes: Any, known: Any, pair: tuple[int, int]) -> None:
     axes.plot(known.values[i] + x, known.values[j] + y)
     axes.plot(known.values[i], known.values[j], "+")
     axes.set(xlabel=known.names[i], ylabel=known.names[j], title=f"{100 * known.confidence:.0f} % region")
+
+
+def _not_quadratic(fit: Any) -> list[str]:
+    """The parameters at the ends of whose intervals the loss is far from what its curvature at the minimum says."""
+    known = fit.evidence
+    unit = 1.0 if fit.data.knows_noise or fit.data.estimates_spread else known.noise**2
+    usable = np.isfinite(known.std) & (known.std > 0) & ~known.at_end
+    if fit.data.loss.is_robust or not np.isfinite(unit) or unit == 0 or not fit.has_settled:
+        return []
+    bent = []
+    for name in np.array(known.names)[usable][:_INTERVALS]:
+        rise = (fit.losses_along(name, [-_REACH, _REACH]) - fit.loss) / (0.5 * unit * _REACH**2)
+        if np.abs(rise - 1).max() > _BENT:
+            bent.append(str(name))
+    return bent[:_PAIRS]
+
+
+def _profile(axes: Any, fit: Any, name: str) -> None:
+    """The loss along a parameter, and the parabola that its interval rests on."""
+    known = fit.evidence
+    steps = np.linspace(-_REACH, _REACH, 9)
+    unit = 1.0 if fit.data.knows_noise else known.noise**2
+    axes.plot(steps, (fit.losses_along(name, steps) - fit.loss) / unit, marker=".", label="loss")
+    axes.plot(steps, 0.5 * steps**2, color="gray", linewidth=0.8, label="parabola")
+    axes.set(xlabel=f"{name}, standard deviations", ylabel="loss above the least", title="not quadratic")
+    axes.legend()
 
 
 def _on_surface(axes: Any, fit: Any, data: Observations, predicted: np.ndarray, surface: Any) -> None:

@@ -1,6 +1,6 @@
 """What a person wants to run: a name, options or a file become a `Scenario`, ready to be solved."""
 
-from .observed import Wanted
+from .observed import Places, Wanted
 from .paper import BUILT_IN, SCENARIOS, SOURCES
 from .reader import ScenarioError, read_text
 from .scenario import Options, Scenario, Settings
@@ -13,6 +13,7 @@ __all__ = [
     "SOURCES",
     "VIEWS",
     "Options",
+    "Places",
     "Scenario",
     "ScenarioError",
     "Settings",

@@ -25,11 +25,13 @@ class Places:
         vertices: (N,) vertices, in the order of the mesh.
         points: (N, 3) points in space.
         patches: (V,) number of the patch of each vertex, in the order of the mesh; -1 for none.
+        operator: (N, V) dense weights of the vertices in each measurement, in the order of the mesh.
     """
 
     vertices: np.ndarray | None = None
     points: np.ndarray | None = None
     patches: np.ndarray | None = None
+    operator: np.ndarray | None = None
 
     def is_same(self, other: "Places") -> bool:
         """Whether two files have the same places."""
@@ -47,8 +49,8 @@ class Wanted:
         times: (T,).
         places: where it was measured.
         species: (S,) columns of the state that were seen.
-        options: noise, relative noise, loss, scale and offset, by the names that observations have for them; True
-            for a scale or an offset that is unknown.
+        options: noise, relative noise, loss, scale, offset and background, by the names that observations have for
+            them; True for a scale or an offset that is unknown.
         max_steps: number of steps of the fit at most.
         files: files that were read.
     """
@@ -94,14 +96,16 @@ def wanted(
     options = _options(table)
     max_steps = table.count("max_steps", 200, 1, 100_000)
     files: list[Path] = []
-    patches = _patches(table, mesh, folder, files)
-    seen, times, where, names = [], [], Places(), None
+    patches, operator = _patches(table, mesh, folder, files), _operator(table, mesh, folder, files)
+    if patches is not None and operator is not None:
+        raise table.error("operator", "either patches or an operator")
+    seen, times, where, names, order = [], [], Places(), None, np.zeros(0, np.int64)
     for entry in table.tables("data"):
         path = entry.file("file", folder)
         time = entry.number("time", end, 0.0, end)
         entry.finish()
         columns = _columns(path, entry)
-        places, order = _places(columns, mesh, patches, factor, entry)
+        places, order = _places(columns, mesh, patches, operator, factor, entry)
         which = tuple(s for s in species if s in columns)
         if not which:
             raise entry.error("file", f"a file with columns or arrays named {' or '.join(species)}")
@@ -119,6 +123,8 @@ def wanted(
         seen.append(state)
         times.append(time)
         files.append(path)
+    if "background" in table and names:
+        options["background"] = _background(table, names, order, folder, files)
     table.finish()
     if not seen:
         raise table.error("data", "at least one [[fit.data]] with a file and a time")
@@ -168,10 +174,47 @@ def _patches(table: Table, mesh: Mesh, folder: Path, files: list[Path]) -> np.nd
     return ordered
 
 
+def _operator(table: Table, mesh: Mesh, folder: Path, files: list[Path]) -> np.ndarray | None:
+    """The weights of the vertices in each measurement (N, V), in the order of the mesh; None where none are named."""
+    if "operator" not in table:
+        return None
+    path = table.file("operator", folder)
+    weights = _columns(path, table, "operator").get("weights")
+    if weights is None or weights.ndim != 2 or weights.shape[1] != mesh.num_vertices:
+        raise table.error(
+            "operator",
+            f"an .npz file with an array weights of a row of {mesh.num_vertices} numbers for each measurement,",
+        )
+    files.append(path)
+    ordered = np.empty_like(weights)
+    ordered[:, mesh.source_order] = weights
+    return ordered
+
+
+def _background(
+    table: Table, names: tuple[str, ...], order: np.ndarray, folder: Path, files: list[Path]
+) -> np.ndarray:  # fmt: skip
+    """The pattern (N, S) of which the data hold an unknown amount, in the order of the data."""
+    path = table.file("background", folder)
+    columns = _columns(path, table, "background")
+    for name in names:
+        if name not in columns or columns[name].shape != (len(order),) or not np.isfinite(columns[name]).all():
+            raise table.error("background", f"a file with a column {name} of {len(order)} finite numbers")
+    files.append(path)
+    pattern = np.empty((len(order), len(names)))
+    pattern[order] = np.stack([columns[name] for name in names], axis=1)
+    if not pattern.any():
+        raise table.error("background", "a pattern that is not zero everywhere")
+    return pattern
+
+
 def _places(
-    columns: dict[str, np.ndarray], mesh: Mesh, patches: np.ndarray | None, factor: float, table: Table
-) -> tuple[Places, np.ndarray]:
+    columns: dict[str, np.ndarray], mesh: Mesh, patches: np.ndarray | None, operator: np.ndarray | None, factor: float,
+    table: Table,
+) -> tuple[Places, np.ndarray]:  # fmt: skip
     """Where the rows of a file were measured, and the row of the data that each of its rows becomes."""
+    if operator is not None:
+        return Places(operator=operator), np.arange(len(operator))
     numbers_of_vertices = columns.pop("vertex", None)
     if numbers_of_vertices is not None:
         return Places(_vertices(numbers_of_vertices, mesh, table)), np.arange(len(numbers_of_vertices))
