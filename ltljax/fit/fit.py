@@ -35,7 +35,7 @@ class Fit:
         params: the parameters, as the start was given.
         calibration: what was unknown about the measurement: scale, offset and amount of background, by name.
         losses: (steps,) half the sum of squared residuals after every step, the first step being the start. Where the
-            spread of the residuals is taken from the data, these are the steps with the last spread.
+            spread of the residuals is taken from the data it changes a few times, and the unit of the loss with it.
         reason: why it stopped, in words.
         has_settled: whether it stopped because the parameters or the loss no longer changed, or no step lowers the
             loss.
@@ -300,12 +300,12 @@ def fit(
     def unit(loss: float) -> float:
         return max(0.0 if data.noise is None else 0.5, loss / data.num_values)
 
-    num_steps, end = 0, End(z, [], "", False)
+    num_steps, losses, end = 0, [], End(z, [], "", False)
     for round_ in range(_ROUNDS):
         steps = range(max_steps - num_steps)
         steps = watched("fit", unit="step")(steps) if progress else steps
         end = search(problem.solver, function, z, steps, unit, after)
-        z, num_steps = end.z, num_steps + len(end.losses)
+        z, num_steps, losses = end.z, num_steps + len(end.losses), losses + end.losses
         if not data.has_moving_spread:
             break
         changed, change = _respread(data, residuals, values_of(residuals, z)[1])
@@ -317,7 +317,7 @@ def fit(
             break
         residuals = changed
         function = dataclasses.replace(function, residuals=residuals)
-    return _found(problem, residuals, end, num_steps, scanned, confidence)
+    return _found(problem, residuals, dataclasses.replace(end, losses=losses), scanned, confidence)
 
 
 def _respread(data: Observations, residuals: Program, misfit: Array) -> tuple[Program, float]:
@@ -342,7 +342,7 @@ def _scanned(residuals: Any, z: Array) -> tuple[Array, str]:
 
 
 def _found(
-    problem: Problem, residuals: Program, end: End, num_steps: int, scanned: str, confidence: float
+    problem: Problem, residuals: Program, end: End, scanned: str, confidence: float
 ) -> Fit:  # fmt: skip
     data, space, z = problem.data, problem.space, end.z
     spread = np.asarray(residuals.arrays.spread, np.float64)
@@ -370,6 +370,6 @@ def _found(
     agreed = agreement(data, misfit, free, scales, z.size, surface)
     params, calibration = space.values(z)
     return Fit(
-        params, calibration, np.array(end.losses), reason, has_settled, num_steps, problem.method, misfit, known,
+        params, calibration, np.array(end.losses), reason, has_settled, len(end.losses), problem.method, misfit, known,
         agreed, scanned, penalties, problem, residuals, z,
     )  # fmt: skip

@@ -41,6 +41,8 @@ def picture(fit: Any, data: Observations, surface: Any = None, observed: np.ndar
     axes = figure.add_subplot(grid[0, 0])
     axes.semilogy(np.maximum(fit.losses, 1e-300), marker=".")
     axes.set(xlabel="step", ylabel="loss", title="loss")
+    if data.has_moving_spread:
+        axes.set(title="loss, in units of the noise so far")
     predicted = np.asarray(data.of(fit.prediction, fit.calibration) if observed is None else observed)
     _against(figure.add_subplot(grid[0, 1]), fit, data, predicted)
     if known is not None:
@@ -106,6 +108,7 @@ def _ellipse(axes: Any, known: Any, pair: tuple[int, int]) -> None:
     x, y = radius * vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
     axes.plot(known.values[i] + x, known.values[j] + y)
     axes.plot(known.values[i], known.values[j], "+")
+    axes.locator_params(nbins=3)
     axes.set(xlabel=known.names[i], ylabel=known.names[j], title=f"{100 * known.confidence:.0f} % region")
 
 
