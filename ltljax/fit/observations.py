@@ -79,7 +79,7 @@ class Observations(eqx.Module):
         species: int | tuple[int, ...] | None = None,
         *,
         mask: Any = None,
-        loss: str | Callable[[Array], Array] = "linear",
+        loss: Any = "linear",
         relative_noise: float | None = None,
         scale: Any = None,
         offset: Any = None,

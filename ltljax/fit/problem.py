@@ -43,7 +43,7 @@ class FitResiduals(eqx.Module):
         spread: standard deviation of the misfit in units of the noise.
     """
 
-    model: Model
+    model: Model | None
     data: Observations
     space: Unknowns
     penalty: Residuals | None
@@ -53,6 +53,7 @@ class FitResiduals(eqx.Module):
     def predicted(self, z: Array) -> Any:
         """What the model gives."""
         params = self.space.params(z)
+        assert self.model is not None, "what differs from fit to fit has no model"
         if isinstance(self.model, Experiment):
             return self.model(params, self.data.times, self.adjoint)
         return self.model(params) if self.adjoint is None else self.model(params, adjoint=self.adjoint)

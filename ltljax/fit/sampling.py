@@ -28,11 +28,11 @@ class Sampling(eqx.Module):
     weights: Float[Array, "M K"]
     num_vertices: int = eqx.field(static=True)
 
-    def __call__(self, u: Float[AnyArray, "V *S"], axis: int = 0) -> Float[Array, "M *S"]:
+    def __call__(self, u: Float[AnyArray, "..."], axis: int = 0) -> Float[Array, "..."]:
         """The measurements of a field.
 
         Args:
-            u: field, with the vertices along one of its axes.
+            u: field or series of fields, with the vertices along one of the axes, where the result has measurements.
             axis: axis of the vertices.
         """
         u = jnp.moveaxis(jnp.asarray(u), axis, 0)
