@@ -565,6 +565,7 @@ def test_data_that_cannot_be_used_are_refused(given, message):
         ltl.Observations(**given)
 
 
+@pytest.mark.usefixtures("as_users_call_it")
 def test_points_and_patches_that_cannot_be_used_are_refused(sphere):
     with pytest.raises(ValueError, match=r"Point 1 at \(3, 0, 0\) is 2 from the surface, and 1 of 2 points"):
         ltl.observe_at(sphere, np.array([[1.0, 0, 0], [3.0, 0, 0]]))

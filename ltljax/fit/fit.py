@@ -155,7 +155,7 @@ class Fit:
         """
         from .picture import picture
 
-        model = self._problem.residuals.model
+        model = self._problem.model
         known = model.surface if isinstance(model, Experiment) else None
         return picture(self, self.data, known if surface is None else surface)
 
@@ -351,7 +351,7 @@ def _found(
     if z.size <= MANY and problem.is_least_squares:
         (value, misfit), jacobian = jacobian_of(residuals, z, problem.reverse)
         if bool(jnp.isfinite(jacobian).all()):
-            adaptive = steps_adaptively(problem.residuals.model)
+            adaptive = steps_adaptively(problem.model)
             known = evidence(space, z, data, value, misfit, jacobian, spread, confidence, adaptive)
             free = known.degrees_of_freedom
         else:
@@ -364,7 +364,7 @@ def _found(
     factor = spread if data.estimates_spread else 1.0
     misfit = np.where(np.asarray(data.mask), np.asarray(misfit, np.float64).reshape(shape) * factor, np.nan)
     penalties = float(np.sum(np.asarray(value)[data.values.size :] ** 2))
-    model = problem.residuals.model
+    model = problem.model
     surface = model.surface if isinstance(model, Experiment) and model.vertices is None else None
     scales = np.ones(()) if data.estimates_spread else spread
     agreed = agreement(data, misfit, free, scales, z.size, surface)

@@ -179,6 +179,12 @@ class Problem(eqx.Module):
         return self.residuals.data
 
     @property
+    def model(self) -> Model:
+        """What is fitted to it."""
+        assert self.residuals.model is not None
+        return self.residuals.model
+
+    @property
     def is_least_squares(self) -> bool:
         """Whether the method sees residuals, not their loss alone."""
         return isinstance(self.solver, optx.AbstractLeastSquaresSolver)
