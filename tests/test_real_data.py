@@ -1,4 +1,4 @@
-"""Fits of data as they are measured: outliers, gaps, unknown scales, counts; what is said where a model is wrong."""
+"""Fits of measured data with outliers, gaps, unknown scales and counts, and reports about models that are wrong."""
 
 import dataclasses
 import json
@@ -64,7 +64,7 @@ def with_outliers(values, seed):
     return np.where(off, values + 20 * chance.choice([1, 1, 1, -1], values.shape), values), off
 
 
-# Of 20 intervals that each hold the truth with 95 %, at least 18 do with a probability of 92 %.
+# If each interval holds the truth with a probability of 95 %, at least 18 of 20 do with a probability of 92 %.
 SEEDS, ENOUGH = range(20), 18
 
 
@@ -460,7 +460,7 @@ def test_errors_over_their_standard_deviations_have_a_size_of_one():
         fit = ltl.fit(lambda p: jnp.stack([p @ shape] * 2, axis=1), np.array([1.5, 1.5]), ltl.Observations(pair))
         off["species"].append((np.asarray(fit.params) - truth) / fit.evidence.std)
     for name, values in off.items():
-        # Of 120 values the mean square is one within 13 %.
+        # The mean square of 120 normal values has a standard deviation of 13 %.
         assert np.mean(np.square(values)) == pytest.approx(1, abs=0.4), name
 
 

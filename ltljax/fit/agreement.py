@@ -189,7 +189,12 @@ def agreement(
 
 
 def _expected(free: float, rates: np.ndarray | None) -> tuple[float, float]:
-    """The interval that holds a reduced chi square with 95 %: of normal noise, or of counts with such rates."""
+    """The interval that holds the reduced chi square of a right model with a probability of 95 %.
+
+    Args:
+        free: degrees of freedom.
+        rates: rates of the counts; None for normal noise.
+    """
     if rates is None:
         return float(stats.chi2.ppf(0.025, free) / free), float(stats.chi2.ppf(0.975, free) / free)
     # A squared Pearson residual of a count with the rate l has the variance 2 + 1 / l.

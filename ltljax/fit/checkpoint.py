@@ -1,4 +1,4 @@
-"""An interrupted fit on disk: its unknowns, and what another fit must be to go on from them."""
+"""An interrupted fit on disk: its unknowns, and the checks that only the same fit goes on from them."""
 
 import dataclasses
 import io
@@ -50,6 +50,7 @@ class Checkpoint:
         try:
             with np.load(self.path, allow_pickle=False) as file:
                 kept = {name: file[name] for name in ("unknowns", "names", "scales", "loss", "spread", "fit")}
+        # NumPy meets damaged files with any of these.
         except (ValueError, KeyError, OSError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile):
             raise RestartError(f"{self.path} is damaged, or no file of a fit. {_ANEW}") from None
         if tuple(kept["names"]) != self.space.names:

@@ -94,7 +94,7 @@ def as_loss(loss: Any) -> Loss:
     z = jnp.asarray(np.concatenate([[0.0], np.logspace(-4, 4, 33)]))
     try:
         values = np.asarray(loss(z), np.float64)
-    except Exception as error:
+    except Exception as error:  # of a function by the user, which may raise any
         raise ValueError(f"The loss fails on an array of squared residuals: {type(error).__name__}: {error}") from error
     if values.shape != z.shape or not np.isfinite(values).all():
         raise ValueError("Expected a loss that returns one finite number for each squared residual from 0 to 10,000.")
@@ -103,4 +103,4 @@ def as_loss(loss: Any) -> Loss:
             f"Expected a loss rho(z) with rho(0) = 0 that rises with z, found rho(0) = {values[0]:.3g}, rho(1e-4) = "
             f"{values[1]:.3g} and rho(1e4) = {values[-1]:.3g}."
         )
-    return Loss(getattr(loss, "__name__", "loss"), loss, 1.0)  # type: ignore
+    return Loss(getattr(loss, "__name__", "loss"), loss, 1.0)  # type: ignore (its values were checked above)

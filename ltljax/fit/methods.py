@@ -132,7 +132,7 @@ def _prepared(method: Any, reach: Array | None = None) -> Any:
     """A method whose steps are counted and can be taken back."""
     if type(method) is optx.LevenbergMarquardt:
         kept = method
-        method = Marquardt(kept.rtol, kept.atol, kept.norm, kept.descent.linear_solver, kept.verbose, reach)  # type: ignore
+        method = Marquardt(kept.rtol, kept.atol, kept.norm, kept.descent.linear_solver, kept.verbose, reach)  # type: ignore (not seen as a class of optimistix's)
         method = eqx.tree_at(lambda m: m.search, method, kept.search)
     if isinstance(method.search, optx.LearningRate):
         # Whole steps where they lower the loss, shorter ones where not.

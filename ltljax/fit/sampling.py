@@ -134,7 +134,7 @@ def as_sampling(operator: Any, dtype: Any = None) -> Sampling:
     """The measurements of a linear operator: a `Sampling`, or a matrix (M, V), dense or sparse.
 
     Raises:
-        ValueError: it is none of these, not finite, or has a row without entries.
+        ValueError: the operator is none of these, has entries that are not finite, or a row without entries.
     """
     if isinstance(operator, Sampling):
         return operator
