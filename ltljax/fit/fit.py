@@ -15,12 +15,21 @@ from .agreement import Agreement, agreement
 from .checkpoint import Checkpoint
 from .methods import MANY
 from .observations import Experiment, Observations
-from .problem import Model, Problem, Program, Residuals, jacobian_of, prepare, steps_adaptively, values_of
+from .problem import (
+    Model,
+    Problem,
+    Program,
+    Residuals,
+    first_unknowns,
+    jacobian_of,
+    prepare,
+    steps_adaptively,
+    values_of,
+)
 from .report import Evidence, evidence
 from .report import summary as _summary
 from .scan import better_start, explains_nothing
 from .search import End, FitError, search
-from .unknowns import unknowns
 
 # The spread of the misfit and the parameters agree when a round of the fit changes the spread by less than this share;
 # rounds at most.
@@ -264,9 +273,7 @@ def fit(
         OutputError: ``checkpoint`` names a file that ltljax did not write.
         FitError: the model fails at the start.
     """
-    calibration = data.calibration.unknowns(data.typical_size)
-    space = unknowns(start, transforms, calibration)
-    z = space.free((start, {name: guess for name, (guess, *_) in calibration.items()}))
+    space, z = first_unknowns(start, transforms, data)
     left = spread = None
     keeper = None if checkpoint is None else Checkpoint(Path(checkpoint), space, data)
     if keeper is not None and resume and keeper.path.exists():

@@ -11,9 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .observations import Observations, refuse_infinite
-from .problem import FitResiduals, Model, Residuals, forward_adjoint, prepare
+from .problem import FitResiduals, Model, Residuals, first_unknowns, forward_adjoint, prepare
 from .scan import distance_to
-from .unknowns import unknowns
 
 
 class ManyFits(eqx.Module):
@@ -98,11 +97,10 @@ def fit_many(
     each = (
         [starts] if rows is None else [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], starts) for k in range(rows)]
     )
-    typical = data.typical_size if many is None else float(np.sqrt(np.mean(np.asarray(many, np.float64) ** 2))) or 1.0
-    calibration = data.calibration.unknowns(typical)
-    guesses = {name: guess for name, (guess, *_) in calibration.items()}
-    space, *_ = [unknowns(start, transforms, calibration) for start in each]
-    z = jnp.stack([space.free((start, guesses)) for start in each])
+    size = None if many is None else float(np.sqrt(np.mean(np.asarray(many, np.float64) ** 2))) or 1.0
+    spaces, vectors = zip(*(first_unknowns(start, transforms, data, size) for start in each), strict=True)
+    space = spaces[0]
+    z = jnp.stack([space.free(own.values(vector)) for own, vector in zip(spaces, vectors, strict=True)])
     problem = prepare(model, space, data, penalty, method, z[0], rtol, atol)
 
     def one(z, values):
@@ -189,21 +187,21 @@ def explore(
     in_log = (least > 0) & logarithmic
     safe = np.where(in_log, least, 1.0), np.where(in_log, most, 1.0)
     points = np.where(in_log, safe[0] * (safe[1] / safe[0]) ** share, least + (most - least) * share)
-    calibration = data.calibration.unknowns(data.typical_size)
-    guesses = {name: jnp.asarray(guess) for name, (guess, *_) in calibration.items()}
-    space = unknowns(rebuild(jnp.asarray(points[0])), None, calibration)
+    space, first = first_unknowns(rebuild(jnp.asarray(points[0])), None, data)
+    guesses = space.calibration(first)
     spread = jnp.ones(data.spread_shape, jnp.result_type(float))
     residuals = FitResiduals(model, data, space, None, forward_adjoint(model), spread)
     free = jax.vmap(lambda point: space.free((rebuild(point), guesses)))
     z = np.asarray(free(jnp.asarray(points, jnp.result_type(float))))
     data.check(eqx.filter_eval_shape(lambda z: residuals.predicted(z), z[0]))
-    # Of unknown scales and noise each point would need its own: then points are compared by their distance instead.
-    seen = lambda z: data.of(residuals.predicted(z))  # noqa: E731
-    converted = eqx.filter_closure_convert(
-        seen if calibration or data.has_moving_spread else residuals, jnp.asarray(z[0])
-    )
-    by_distance = bool(calibration) or data.has_moving_spread
-    several = eqx.filter_jit(lambda c, z: jax.vmap(lambda z: c(z) if by_distance else 0.5 * jnp.sum(c(z) ** 2))(z))
+    # If scale or noise is unknown each point has its own best one, and points are compared by their distance.
+    by_distance = bool(guesses) or data.has_moving_spread
+
+    def asked(z: Array) -> Array:
+        return data.of(residuals.predicted(z)) if by_distance else 0.5 * jnp.sum(residuals(z) ** 2)
+
+    converted = eqx.filter_closure_convert(asked, jnp.asarray(z[0]))
+    several = eqx.filter_jit(lambda c, z: jax.vmap(c)(z))
     batch = min(batch, count)
     losses = np.empty(count)
     for begin in range(0, count, batch):

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from ..solve.fingerprint import fingerprint, read_from_modules
 from .methods import MANY, method_of
 from .observations import Experiment, Observations
-from .unknowns import Unknowns
+from .unknowns import Unknowns, unknowns
 
 # The first damping, relative to the Jacobian's norm: after Marquardt (1963), who begins with a hundredth of its square.
 _DAMPING = 0.1
@@ -361,6 +361,22 @@ def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
     except TypeError:
         return None
     return key
+
+
+def first_unknowns(
+    start: Any, transforms: Any, data: Observations, size: float | None = None
+) -> tuple[Unknowns, Array]:
+    """The unknowns of a fit, those of the measurement among them, and their first vector.
+
+    Args:
+        start: first guess of the parameters.
+        transforms: ranges of the parameters, as of `fit`.
+        data: data.
+        size: typical size of the data, where it is not that of ``data``.
+    """
+    calibration = data.calibration.unknowns(data.typical_size if size is None else size)
+    space = unknowns(start, transforms, calibration)
+    return space, space.free((start, {name: guess for name, (guess, *_) in calibration.items()}))
 
 
 def forward_adjoint(model: Model) -> diffrax.AbstractAdjoint | None:

@@ -129,33 +129,56 @@ def evidence(
     relative = j[:num_values] * (sizes / np.where(slopes == 0, 1.0, slopes))
     _, singular, directions = np.linalg.svd(relative, full_matrices=num_values < size)
     singular = np.concatenate([singular, np.zeros(size - len(singular))])
-    # In units of the noise of each value.
-    known = np.where(np.isfinite(deviations) & (deviations > 0), deviations, 1.0)
-    _, in_noise, told = np.linalg.svd(relative / known[:, None], full_matrices=num_values < size)
-    in_noise = np.concatenate([in_noise, np.zeros(size - len(in_noise))])
-    level = _level(data, spread * known.reshape(data.values.shape))
-    rounding = float(np.sqrt(jnp.finfo(jacobian.dtype).eps))
-    said = [
-        f"{name} has run to the end of its range, {value:.4g}: the data would have it there or beyond, and its "
-        "interval means nothing."
+    beyond = [
+        f"{name} has run to the end of its range, {value:.4g}. The best value lies there or beyond, and the interval "
+        "means nothing."
         for name, value, ended in zip(space.names, values, at_end, strict=True)
         if ended
     ]
-    for value, direction in zip(in_noise, told, strict=True):
-        if np.abs(direction[at_end]).max(initial=0.0) > _VAGUE:
-            continue
-        is_vague, share = np.isfinite(sigma) and _VAGUE * value < 1, value / level
-        if share < rounding or (is_vague and adaptive and share < _UNSEEN):
-            said.append(_sentence(space.names, direction, share, "tell", "not seen at all"))
-        elif is_vague:
-            said.append(_sentence(space.names, direction, share, "tell", f"known to {100 / value:.0f} % only"))
-        elif adaptive and share < _UNSEEN:
-            less = "less than the errors that adaptive steps may have: tighten rtol and atol, or give dt="
-            said.append(_sentence(space.names, direction, share, "safely tell", less))
+    # In units of the noise of each value.
+    units = np.where(np.isfinite(deviations) & (deviations > 0), deviations, 1.0)
+    level = _level(data, spread * units.reshape(data.values.shape))
+    rounding = float(np.sqrt(jnp.finfo(jacobian.dtype).eps))
+    vague = _vague(
+        space.names, relative / units[:, None], at_end, level, rounding, adaptive, is_known=bool(np.isfinite(sigma))
+    )
     return Evidence(
         space.names, values, slopes[:, None] * in_z * slopes, slopes * std_z, (ends[0][0], ends[1][0]),
-        np.array([_flat(end) for end in ends]), at_end, confidence, singular, directions, noise, free, tuple(said),
+        np.array([_flat(end) for end in ends]), at_end, confidence, singular, directions, noise, free,
+        (*beyond, *vague),
     )  # fmt: skip
+
+
+def _vague(
+    names: tuple[str, ...], jacobian: np.ndarray, at_end: np.ndarray, level: float, rounding: float, adaptive: bool,
+    is_known: bool,
+) -> list[str]:  # fmt: skip
+    """A sentence for each direction of the parameters that the data do not determine.
+
+    Args:
+        names: names of the parameters.
+        jacobian: (M, n) derivative of the predictions with respect to relative changes, in units of the noise.
+        at_end: (n,) which parameters are at the end of their range, about which nothing is said.
+        level: size of the data's variation, in units of the noise.
+        rounding: share of it below which a change is rounding.
+        adaptive: whether the model takes adaptive steps, whose errors hide small changes.
+        is_known: whether the noise is known or estimated.
+    """
+    size = len(names)
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=len(jacobian) < size)
+    sentences = []
+    for value, direction in zip(np.concatenate([singular, np.zeros(size - len(singular))]), directions, strict=True):
+        if np.abs(direction[at_end]).max(initial=0.0) > _VAGUE:
+            continue
+        is_vague, share = is_known and _VAGUE * value < 1, value / level
+        if share < rounding or (is_vague and adaptive and share < _UNSEEN):
+            sentences.append(_sentence(names, direction, share, "tell", "not seen at all"))
+        elif is_vague:
+            sentences.append(_sentence(names, direction, share, "tell", f"known to {100 / value:.0f} % only"))
+        elif adaptive and share < _UNSEEN:
+            less = "less than the errors that adaptive steps may have: tighten rtol and atol, or give dt="
+            sentences.append(_sentence(names, direction, share, "safely tell", less))
+    return sentences
 
 
 def _of_pearson(data: Observations, misfit: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
