@@ -378,7 +378,7 @@ def main():
     names = [name.strip() for name in arguments.problems.split(",")]
     if unknown := set(names) - set(PROBLEMS):
         parser.error(f"no such problem: {', '.join(sorted(unknown))}; choose among {', '.join(PROBLEMS)}")
-    warnings.simplefilter("ignore", ltl.InconsistentRowsWarning)
+    warnings.simplefilter("ignore", ltl.errors.InconsistentRowsWarning)
     tables = {name: PROBLEMS[name]() for name in names}
     for name, rows in tables.items():
         print(f"\n{PROBLEMS[name].__doc__.splitlines()[0]}\n")

@@ -38,7 +38,7 @@ def main():
             rights = [f - float(surface.mass @ f / surface.mass.sum()) for f in rights]
             ways = {}
             ltl.laplacian(surface, rights[-1])
-            for way, set_up in (("multigrid", ltl.multigrid), ("factor", ltl.factorized)):
+            for way, set_up in (("multigrid", ltl.solvers.multigrid), ("factor", ltl.solvers.factorized)):
                 start = time.perf_counter()
                 inverse = set_up(surface)
                 middle = time.perf_counter()

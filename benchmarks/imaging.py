@@ -241,7 +241,9 @@ PARTS = {part.__name__: part for part in (transport, distance, curvature, flow, 
 
 def our_transport(mesh):
     surface = ltl.Surface.from_mesh(mesh)
-    return lambda source, vector: ltl.transport_vectors(surface, source, on_plane(vector, surface.normals[source]))
+    return lambda source, vector: ltl.vectors.transport_vectors(
+        surface, source, on_plane(vector, surface.normals[source])
+    )
 
 
 def potpourri_transport(mesh, t_coef=1.0):

@@ -106,7 +106,7 @@ def eight_unknowns():
 
     truth = dict(a=0.1, b=0.9, du=1.0, dv=10.0, rate=30.0, tilt=np.array([0.1, -0.05, 0.02]))
     start = dict(a=0.12, b=0.8, du=1.2, dv=8.5, rate=27.0, tilt=np.zeros(3))
-    experiment = ltl.Experiment(equation, surface, start_of(surface), max_steps=2000)
+    experiment = ltl.inverse.Experiment(equation, surface, start_of(surface), max_steps=2000)
     return experiment, truth, start, np.array([0.1, 0.25, 0.5])
 
 
@@ -164,22 +164,24 @@ def starts():
         def equation(p):
             return ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0))
 
-        experiment = ltl.Experiment(equation, surface, start_of(surface))
+        experiment = ltl.inverse.Experiment(equation, surface, start_of(surface))
         truth, times = dict(a=0.1, b=0.9, d=10.0), np.array([0.1, 0.25])
         data = ltl.Observations(experiment(truth, times).us, times=times)
         many = {key: value * random.uniform(0.7, 1.3, 32) for key, value in truth.items()}
         seconds = []
         for _ in range(2):
             begin = time.perf_counter()
-            found = ltl.fit_many(experiment, many, data, transforms=ltl.Positive())
+            found = ltl.inverse.fit_many(experiment, many, data, transforms=ltl.inverse.Positive())
             jax.block_until_ready(found.losses)
             seconds.append(time.perf_counter() - begin)
         assert np.allclose(np.asarray(found.params["a"]), 0.1, rtol=1e-3)
-        ltl.fit(experiment, {key: float(values[0]) for key, values in many.items()}, data, transforms=ltl.Positive())
+        ltl.fit(
+            experiment, {key: float(values[0]) for key, values in many.items()}, data, transforms=ltl.inverse.Positive()
+        )
         begin = time.perf_counter()
         for k in range(32):
             one = {key: float(values[k]) for key, values in many.items()}
-            ltl.fit(experiment, one, data, transforms=ltl.Positive())
+            ltl.fit(experiment, one, data, transforms=ltl.inverse.Positive())
         loop = time.perf_counter() - begin
         print(
             f"| {surface.num_vertices} | {seconds[1]:.1f} | {loop:.1f} | {loop / seconds[1]:.2f} | {seconds[0]:.1f} |",

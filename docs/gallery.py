@@ -13,8 +13,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from ltljax import scenario
-from ltljax.cli import main as ltljax
+from ltljax.app import scenario
+from ltljax.app.cli import main as ltljax
 
 HERE = Path(__file__).parent
 MESHES = HERE.parents[1] / "shared" / "meshes"

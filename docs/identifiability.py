@@ -34,7 +34,7 @@ def schnakenberg(u0=U0):
     def equation(p):
         return ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0))
 
-    return ltl.Experiment(equation, SURFACE, u0)
+    return ltl.inverse.Experiment(equation, SURFACE, u0)
 
 
 def say(title, found):
@@ -44,7 +44,7 @@ def say(title, found):
 def growing_pattern():
     experiment, times = schnakenberg(), np.array([0.1, 0.25, 0.5])
     data = ltl.Observations(*noisy(experiment(TRUTH, times).us), times)
-    say("three snapshots of a growing pattern", ltl.fit(experiment, GUESS, data, transforms=ltl.Positive()))
+    say("three snapshots of a growing pattern", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
 
 
 def one_scale():
@@ -56,7 +56,7 @@ def one_scale():
 
     truth = dict(du=1.0, dv=10.0, rate=30.0)
     data = ltl.Observations(*noisy(model(jax.tree.map(jnp.asarray, truth))))
-    found = ltl.fit(model, dict(du=1.05, dv=10.3, rate=30.5), data, transforms=ltl.Positive(), max_steps=30)
+    found = ltl.fit(model, dict(du=1.05, dv=10.3, rate=30.5), data, transforms=ltl.inverse.Positive(), max_steps=30)
     say("one picture of a pattern that has become stationary", found)
 
 
@@ -66,7 +66,7 @@ def uniform_start():
     values = np.asarray(experiment(TRUTH, times).us)
     level = 0.01 * values.std()
     data = ltl.Observations(values + level * RNG.normal(size=values.shape), level, times)
-    say("a uniform mixture", ltl.fit(experiment, GUESS, data, transforms=ltl.Positive()))
+    say("a uniform mixture", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
 
 
 def real_data():
@@ -79,13 +79,15 @@ def real_data():
     far = {key: 300 * value for key, value in TRUTH.items()}
 
     def fitted(values, start=GUESS, **options):
-        return ltl.fit(experiment, start, ltl.Observations(values, times=times, **options), transforms=ltl.Positive())
+        return ltl.fit(
+            experiment, start, ltl.Observations(values, times=times, **options), transforms=ltl.inverse.Positive()
+        )
 
     cases = (
         ("three values in a hundred off by 20, least squares", fitted(wrong)),
         ('three values in a hundred off by 20, `loss="huber"`', fitted(wrong, loss="huber")),
         ("times 3.7, factor not given", fitted(3.7 * clean)),
-        ("times 3.7, `scale=Positive(1.0)`", fitted(3.7 * clean, scale=ltl.Positive(1.0))),
+        ("times 3.7, `scale=Positive(1.0)`", fitted(3.7 * clean, scale=ltl.inverse.Positive(1.0))),
         ("a third missing", fitted(gaps)),
         ("a guess 300 times too large", fitted(clean, far)),
     )
@@ -105,7 +107,7 @@ def too_late():
     experiment, times = schnakenberg(), np.array([2.0])
     data = ltl.Observations(*noisy(experiment(TRUTH, times).us), times)
     say("one late picture, from a first guess 30 % off", ltl.fit(
-        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.Positive(), max_steps=40
+        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.inverse.Positive(), max_steps=40
     ))  # fmt: skip
 
 
@@ -155,16 +157,16 @@ def diffusivity_field():
         "| start | weight | misfit over values | relative error of the logarithm |\n| --- | --- | --- | --- |"
     )
     for title, u0 in (("waves everywhere", waves), ("waves on one half", waves * np.clip(2 * x[:, 2], 0, 1))):
-        experiment = ltl.Experiment(equation, surface, u0, dt=0.01, solver=ltl.RKL2())
+        experiment = ltl.inverse.Experiment(equation, surface, u0, dt=0.01, solver=ltl.RKL2())
         data = ltl.Observations(*noisy(experiment(dict(log=jnp.asarray(truth)), times).us), times)
 
         def with_weight(weight, start, experiment=experiment, data=data):
             return ltl.fit(
                 experiment, dict(log=np.zeros(len(x))) if start is None else start, data,
-                penalty=lambda p: ltl.smoothness(surface, p["log"], weight, mass), max_steps=150,
+                penalty=lambda p: ltl.inverse.smoothness(surface, p["log"], weight, mass), max_steps=150,
             )  # fmt: skip
 
-        weight, found, curve = ltl.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0, 60.0])
+        weight, found, curve = ltl.inverse.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0, 60.0])
         for half, name in ((x[:, 2] > 0, "upper half"), (x[:, 2] < 0, "lower half")):
             error = np.linalg.norm((found.params["log"] - truth)[half]) / np.linalg.norm(truth[half])
             print(f"| {title}, {name} | {weight:g} | {curve[-1, 1] / data.values.size:.2f} | {error:.2f} |", flush=True)

@@ -64,7 +64,7 @@ def lines():
     surface = ltl.Surface.from_mesh(ltl.load_mesh(MESHES / "spot.obj"))
     bent = ltl.curvature(surface)
     guide = bent.directions[:, 1] * (bent.principal[:, :1] - bent.principal[:, 1:])
-    field = ltl.direction_field(surface, 2, guide=guide, time=1e-3)
+    field = ltl.vectors.direction_field(surface, 2, guide=guide, time=1e-3)
     picture, _ = ltl.imaging.lic_picture(surface, field, view=COW, resolution=SIZE, is_directed=False)
     return np.stack([picture] * 3, axis=2)
 
@@ -74,7 +74,7 @@ def carried():
     mesh = ltl.shapes.torus(n_major=96, n_minor=48)
     surface = ltl.Surface.from_mesh(mesh)
     source = int(jnp.argmax(surface.vertices @ jnp.array([0.0, -0.4, 1.0])))
-    X = np.asarray(ltl.transport_vectors(surface, source, surface.geometry.frames[source, 0]))
+    X = np.asarray(ltl.vectors.transport_vectors(surface, source, surface.geometry.frames[source, 0]))
     plotter = pyvista.Plotter(off_screen=True, window_size=[SIZE, SIZE])
     plotter.set_background("white")
     plotter.add_mesh(

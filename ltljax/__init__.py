@@ -1,250 +1,54 @@
 """Differentiable partial differential equations on triangle meshes, in JAX, by local tangential lifting.
 
-The data's way: a mesh file becomes a `Mesh`, a mesh and a scheme a `Surface`; operators act on fields over a surface;
-equations are made of operators; `solve` carries them through time.
+A mesh file becomes a `Mesh`; a mesh and a scheme become a `Surface`; operators act on fields over the surface;
+equations are made of operators; `solve` integrates them in time.
 
     mesh = ltl.load_mesh("spot.obj")
     surface = ltl.Surface.from_mesh(mesh)
     solution = ltl.solve(ltl.Diffusion(), surface, u0, t1=1.0)
+
+`__init__.pyi` lists the public names and the module each comes from. A name is imported when it is first used.
 """
 
-from importlib.metadata import version as _version
+import importlib
+from typing import Any
 
-from . import imaging
-from .construction import CoarseMeshWarning, InconsistentRowsWarning
-from .curvature import Curvature, PolyhedralCurvature, curvature, polyhedral_curvature
-from .elliptic import EllipticStencil, direction_tensor, elliptic_stencil
-from .equations import (
-    CahnHilliard,
-    Diffusion,
-    Dirichlet,
-    Equation,
-    Moving,
-    Neumann,
-    ReactionDiffusion,
-    Robin,
-    VectorDiffusion,
-    kinetics,
-)
-from .fit import (
-    Agreement,
-    Bounded,
-    Evidence,
-    Experiment,
-    Fit,
-    FitError,
-    GradientCheck,
-    ManyFits,
-    Observations,
-    PatternStatistics,
-    Positive,
-    Real,
-    Sampling,
-    check_gradient,
-    choose_weight,
-    explore,
-    fit,
-    fit_many,
-    observe_at,
-    observe_patches,
-    pattern_statistics,
-    smoothness,
-    total_variation,
-)
-from .lifting.schemes import Monotone, Paper, Polynomial
-from .mesh import Mesh, MeshError, as_mesh, load_mesh, shapes, vertex_data
-from .operators import (
-    divergence,
-    gradient,
-    growth_rate,
-    hessian,
-    integrate,
-    laplacian,
-    laplacian_matrix,
-    spectral_bound,
-    spectral_width,
-    weighted_laplacian,
-)
-from .output.load import load_fields
-from .output.save import save
-from .show import displaced, plot, plot_dispersion, view
-from .solve import (
-    RKL1,
-    RKL2,
-    SBDF2,
-    TRBDF2,
-    BackwardEuler,
-    CrankNicolson,
-    Dispersion,
-    Eigenmodes,
-    Explanation,
-    Factorized,
-    GrowingModesWarning,
-    HarmonicFields,
-    HodgeParts,
-    IncompatibleSourceWarning,
-    Multigrid,
-    RestartError,
-    Solution,
-    SolveError,
-    Steady,
-    connection_matrix,
-    direction_field,
-    dispersion,
-    eigenmodes,
-    explain,
-    factorized,
-    geodesic_distance,
-    harmonic_fields,
-    helmholtz_hodge,
-    multigrid,
-    poisson,
-    screened_poisson,
-    solve,
-    steady_state,
-    transport_vectors,
-)
-from .surface import FarFromOriginWarning, Surface
-from .vectors import (
-    Connection,
-    connection,
-    covariant_derivative,
-    curl,
-    from_frame,
-    hodge_laplacian,
-    lie_bracket,
-    lie_derivative,
-    rotated,
-    rotated_gradient,
-    singularities,
-    tangential,
-    tensor_laplacian,
-    to_frame,
-    transport_along,
-    vector_laplacian,
-)
+import lazy_loader
 
-__version__ = _version("ltljax")
+from ._base.deprecated import warn_deprecated
 
-__all__ = [
-    "RKL1",
-    "RKL2",
-    "SBDF2",
-    "TRBDF2",
-    "Agreement",
-    "BackwardEuler",
-    "Bounded",
-    "CahnHilliard",
-    "CoarseMeshWarning",
-    "Connection",
-    "CrankNicolson",
-    "Curvature",
-    "Diffusion",
-    "Dirichlet",
-    "Dispersion",
-    "Eigenmodes",
-    "EllipticStencil",
-    "Equation",
-    "Evidence",
-    "Experiment",
-    "Explanation",
-    "Factorized",
-    "FarFromOriginWarning",
-    "Fit",
-    "FitError",
-    "GradientCheck",
-    "GrowingModesWarning",
-    "HarmonicFields",
-    "HodgeParts",
-    "IncompatibleSourceWarning",
-    "InconsistentRowsWarning",
-    "ManyFits",
-    "Mesh",
-    "MeshError",
-    "Monotone",
-    "Moving",
-    "Multigrid",
-    "Neumann",
-    "Observations",
-    "Paper",
-    "PatternStatistics",
-    "PolyhedralCurvature",
-    "Polynomial",
-    "Positive",
-    "ReactionDiffusion",
-    "Real",
-    "RestartError",
-    "Robin",
-    "Sampling",
-    "Solution",
-    "SolveError",
-    "Steady",
-    "Surface",
-    "VectorDiffusion",
-    "as_mesh",
-    "check_gradient",
-    "choose_weight",
-    "connection",
-    "connection_matrix",
-    "covariant_derivative",
-    "curl",
-    "curvature",
-    "direction_field",
-    "direction_tensor",
-    "dispersion",
-    "displaced",
-    "divergence",
-    "eigenmodes",
-    "elliptic_stencil",
-    "explain",
-    "explore",
-    "factorized",
-    "fit",
-    "fit_many",
-    "from_frame",
-    "geodesic_distance",
-    "gradient",
-    "growth_rate",
-    "harmonic_fields",
-    "helmholtz_hodge",
-    "hessian",
-    "hodge_laplacian",
-    "imaging",
-    "integrate",
-    "kinetics",
-    "laplacian",
-    "laplacian_matrix",
-    "lie_bracket",
-    "lie_derivative",
-    "load_fields",
-    "load_mesh",
-    "multigrid",
-    "observe_at",
-    "observe_patches",
-    "pattern_statistics",
-    "plot",
-    "plot_dispersion",
-    "poisson",
-    "polyhedral_curvature",
-    "rotated",
-    "rotated_gradient",
-    "save",
-    "screened_poisson",
-    "shapes",
-    "singularities",
-    "smoothness",
-    "solve",
-    "spectral_bound",
-    "spectral_width",
-    "steady_state",
-    "tangential",
-    "tensor_laplacian",
-    "to_frame",
+_load, _list_names, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# Names that were at the top in version 0.1, and the public module each has moved to.
+_MOVED = {
+    "errors": "CoarseMeshWarning FarFromOriginWarning FitError GrowingModesWarning IncompatibleSourceWarning "
+    "InconsistentRowsWarning RestartError",
+    "imaging": "displaced",
+    "inverse": "Agreement Bounded Evidence Experiment Fit GradientCheck ManyFits PatternStatistics Positive Real "
+    "Sampling check_gradient choose_weight explore fit_many observe_at observe_patches pattern_statistics smoothness "
     "total_variation",
-    "transport_along",
-    "transport_vectors",
-    "vector_laplacian",
-    "vertex_data",
-    "view",
-    "weighted_laplacian",
-]
+    "io": "vertex_data",
+    "operators": "Curvature EllipticStencil PolyhedralCurvature direction_tensor elliptic_stencil growth_rate "
+    "polyhedral_curvature spectral_bound spectral_width",
+    "solvers": "Dispersion Eigenmodes Explanation Factorized Multigrid dispersion factorized multigrid plot_dispersion",
+    "vectors": "Connection HarmonicFields HodgeParts connection connection_matrix covariant_derivative curl "
+    "direction_field from_frame harmonic_fields helmholtz_hodge hodge_laplacian lie_bracket lie_derivative rotated "
+    "rotated_gradient singularities tangential tensor_laplacian to_frame transport_along transport_vectors",
+}
+_NEW_HOME = {name: module for module, names in _MOVED.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("ltljax")
+    if name in _NEW_HOME:
+        home = f"ltljax.{_NEW_HOME[name]}"
+        warn_deprecated(f"ltljax.{name}", f"{home}.{name}")
+        return getattr(importlib.import_module(home), name)
+    return _load(name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

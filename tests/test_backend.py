@@ -67,7 +67,7 @@ x = np.linspace(0, 3, 3855)
 model = lambda p: jnp.sin(p["a"] * x) + p["b"] * x + jnp.exp(-p["d"] * x)
 truth = dict(a=1.0, b=2.0, d=0.5)
 starts = {key: value * np.linspace(0.8, 1.2, 8) for key, value in truth.items()}
-found = ltl.fit_many(model, starts, ltl.Observations(np.asarray(model(truth)), 0.1), transforms=ltl.Positive())
+found = ltl.inverse.fit_many(model, starts, ltl.Observations(np.asarray(model(truth)), 0.1), transforms=ltl.inverse.Positive())
 assert found.losses.max() < 1e-3, found.losses
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=100, env=os.environ | {"JAX_ENABLE_X64": "1"})

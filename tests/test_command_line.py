@@ -11,9 +11,9 @@ import pytest
 import trimesh
 
 import ltljax as ltl
-from ltljax import run
-from ltljax.cli import main
-from ltljax.output import files, pictures
+from ltljax._output import files, pictures
+from ltljax.app import run
+from ltljax.app.cli import main
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_the_series_is_read_back_by_vtk_to_the_last_bit(tmp_path):
 
 
 def test_results_come_in_the_order_of_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr("ltljax.output.pictures.can_draw", lambda: False)
+    monkeypatch.setattr("ltljax._output.pictures.can_draw", lambda: False)
     sphere = ltl.shapes.icosphere(2)
     order = np.random.default_rng(0).permutation(sphere.num_vertices)
     shuffled = tmp_path / "shuffled.obj"
@@ -223,9 +223,7 @@ def test_info_prints_the_report_and_list_the_scenarios(capsys, mesh_file):
 
 def test_a_float32_run_needs_no_float64(tmp_path):
     arguments = ["run", "heat", "--dtype", "float32", "--frames", "2", "--out", str(tmp_path)]
-    code = (
-        f"import ltljax.output.pictures as p; p.can_draw = lambda: False; import ltljax.cli as c; c.main({arguments})"
-    )
+    code = f"import ltljax._output.pictures as p; p.can_draw = lambda: False; import ltljax.app.cli as c; c.main({arguments})"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     measured = json.loads((tmp_path / "summary.json").read_text())["measured"]
@@ -265,7 +263,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_results(tmp_path, mesh_file, 
 
     pieces = [*arguments, "--out", str(tmp_path / "pieces")]
     with monkeypatch.context() as patched:
-        patched.setattr(sys.modules["ltljax.run"], "solve", interrupted)
+        patched.setattr(sys.modules["ltljax.app.run"], "solve", interrupted)
         assert main(pieces) == 130
     assert (tmp_path / "pieces" / "restart" / "run.json").exists()
     assert "Go on with the same command and --resume, or start over with --overwrite." in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 
 import ltljax as ltl
-from ltljax.conservation import stationary_measure
+from ltljax._surface.conservation import stationary_measure
 
 
 def test_mass_is_conserved_to_rounding_over_10000_steps(real_mesh):

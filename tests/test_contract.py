@@ -92,7 +92,7 @@ def dented_sphere():
 
 @pytest.mark.parametrize("make", [dented_sphere, bent_disk])
 @pytest.mark.parametrize("name", ["paper", "monotone", pytest.param("polynomial", marks=pytest.mark.slow)])
-@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+@pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 def test_derivatives_of_gradient_and_laplacian_in_the_vertices(make, name):
     surface = ltl.Surface.from_mesh(make(), SCHEMES[name])
     u = field(surface, "laplacian")

@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from jax.test_util import check_grads
 
 import ltljax as ltl
-from ltljax.tables import build_table, difference_sum, differences, reverse_weights, reversible
+from ltljax._tables import build_table, difference_sum, differences, reverse_weights, reversible
 
 rows_of_neighbours = st.integers(2, 9).flatmap(
     lambda n: st.lists(st.lists(st.integers(0, n - 1), max_size=40), min_size=n, max_size=n)
@@ -227,7 +226,7 @@ def test_a_row_of_a_thousand_neighbours_is_not_unrolled():
 ON_TWO_DEVICES = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import PartitionSpec as P
-from ltljax.tables import build_table, difference_sum, reversible
+from ltljax._tables import build_table, difference_sum, reversible
 
 jax.config.update("jax_enable_x64", True)
 table = reversible(build_table(2 * np.arange(11), np.stack([np.roll(np.arange(10), k) for k in (1, 3)], 1).ravel()))

@@ -10,7 +10,7 @@ import ltljax as ltl
 
 
 @pytest.mark.parametrize("name", ["sphere", "torus", "disk", "spot_low.obj", "bunny_closed.obj", "hand_open.obj"])
-@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+@pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 def test_gauss_and_bonnet_hold_to_rounding(name, real_mesh):
     shapes = {
         "sphere": lambda: ltl.shapes.random_sphere(300, seed=0),
@@ -19,14 +19,14 @@ def test_gauss_and_bonnet_hold_to_rounding(name, real_mesh):
     }
     mesh = shapes[name]() if name in shapes else ltl.load_mesh(real_mesh(name))
     surface = ltl.Surface.from_mesh(mesh, ltl.Paper())
-    bent = ltl.polyhedral_curvature(surface)
+    bent = ltl.operators.polyhedral_curvature(surface)
     total = ltl.integrate(surface, bent.gauss) + jnp.sum(bent.turning)
     assert float(total) == pytest.approx(2 * np.pi * mesh.report.euler_number, abs=1e-9)
 
 
 def test_mean_curvature_of_a_sphere():
     surface = ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(4, 0.3, seed=0).scaled(2))
-    bent = ltl.polyhedral_curvature(surface)
+    bent = ltl.operators.polyhedral_curvature(surface)
     # The integral of H over a sphere of radius R is 4 pi R.
     assert float(ltl.integrate(surface, bent.mean)) == pytest.approx(8 * np.pi, rel=2e-3)
     np.testing.assert_allclose(bent.crease_mean, 0)
@@ -35,7 +35,7 @@ def test_mean_curvature_of_a_sphere():
 def test_all_curvature_of_a_fold_is_in_its_crease():
     mesh, x = strip(8, 90)
     surface = ltl.Surface.from_mesh(mesh)
-    bent = ltl.polyhedral_curvature(surface)
+    bent = ltl.operators.polyhedral_curvature(surface)
     # The crease is concave seen from the side of the normals: half of length times angle.
     assert float(ltl.integrate(surface, bent.crease_mean)) == pytest.approx(-np.pi / 4)
     np.testing.assert_allclose(bent.mean, bent.crease_mean, atol=1e-9)
@@ -43,7 +43,7 @@ def test_all_curvature_of_a_fold_is_in_its_crease():
     # Its vector Laplacian and that of Hodge agree: the fold is flat inside.
     X = ltl.gradient(surface, jnp.sin(3 * x))
     inside = ~mesh.boundary_vertices
-    both = [f(surface, X)[inside] for f in (ltl.hodge_laplacian, ltl.vector_laplacian)]
+    both = [f(surface, X)[inside] for f in (ltl.vectors.hodge_laplacian, ltl.vector_laplacian)]
     np.testing.assert_allclose(*both, atol=1e-6)
 
 
@@ -53,7 +53,7 @@ def test_it_is_differentiable_in_the_vertices():
 
     @jax.jit
     def total(h):
-        bent = ltl.polyhedral_curvature(surface.with_vertices(surface.vertices + h * direction))
+        bent = ltl.operators.polyhedral_curvature(surface.with_vertices(surface.vertices + h * direction))
         return jnp.sum(bent.mean**2 + bent.gauss**2)
 
     slope, step = jax.grad(total)(0.0), 1e-5

@@ -24,7 +24,9 @@ def plane(n, D, b):
     tensor, drift = np.zeros((3, 3)), np.array([*b, 0.0])
     tensor[:2, :2] = D
     surface = ltl.Surface.from_mesh(mesh)
-    stencil = ltl.elliptic_stencil(surface, np.broadcast_to(tensor, (size, 3, 3)), np.broadcast_to(drift, (size, 3)))
+    stencil = ltl.operators.elliptic_stencil(
+        surface, np.broadcast_to(tensor, (size, 3, 3)), np.broadcast_to(drift, (size, 3))
+    )
     k = np.array([2.0, 1.0, 0.0])
     phase = mesh.vertices @ k
     exact = -(k @ tensor @ k) * np.sin(phase) + (drift @ k) * np.cos(phase)
@@ -63,7 +65,7 @@ def test_of_the_unit_tensor_it_is_the_laplacian():
     u = jnp.asarray(mesh.vertices[:, 0] * mesh.vertices[:, 1])
     identity = np.broadcast_to(np.eye(3), (mesh.num_vertices, 3, 3))
     for diffusion in (1.0, np.ones(mesh.num_vertices), identity):
-        found = ltl.elliptic_stencil(surface, diffusion)(u)
+        found = ltl.operators.elliptic_stencil(surface, diffusion)(u)
         np.testing.assert_allclose(found, ltl.laplacian(surface, u), atol=1e-10)
 
 
@@ -73,7 +75,7 @@ def test_it_has_a_maximum_principle():
     random = np.random.default_rng(0)
     factors = random.normal(size=(mesh.num_vertices, 3, 3))
     tensors = np.einsum("vij,vkj->vik", factors, factors)
-    stencil = ltl.elliptic_stencil(surface, tensors, random.normal(size=(mesh.num_vertices, 3)))
+    stencil = ltl.operators.elliptic_stencil(surface, tensors, random.normal(size=(mesh.num_vertices, 3)))
     assert least_weight(stencil) >= 0
     step = scipy.sparse.csc_matrix(scipy.sparse.eye_array(mesh.num_vertices) - 0.1 * stencil.matrix())
     u = random.uniform(-1, 1, (mesh.num_vertices, 50))
@@ -87,7 +89,7 @@ def test_coefficients_can_be_changed_and_differentiated():
     surface = ltl.Surface.from_mesh(mesh)
     x, y, z = mesh.vertices.T
     drift = np.stack([-y, x, 0 * x], axis=1)
-    stencil = ltl.elliptic_stencil(surface, 1.0, drift)
+    stencil = ltl.operators.elliptic_stencil(surface, 1.0, drift)
     again = stencil.with_coefficients(surface, 1.0, drift)
     u = jnp.asarray(x * z)
     np.testing.assert_allclose(again(u), stencil(u), atol=1e-9)
@@ -103,15 +105,15 @@ def test_coefficients_that_do_not_fit_are_refused():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
     size = surface.num_vertices
     with pytest.raises(ValueError, match=r"found \(5,\)"):
-        ltl.elliptic_stencil(surface, np.ones(5))
+        ltl.operators.elliptic_stencil(surface, np.ones(5))
     with pytest.raises(ValueError, match="must not be negative"):
-        ltl.elliptic_stencil(surface, -1.0)
+        ltl.operators.elliptic_stencil(surface, -1.0)
     skew = np.zeros((size, 3, 3))
     skew[3, 0, 1] = 1
     with pytest.raises(ValueError, match="must be symmetric, but at vertex 3"):
-        ltl.elliptic_stencil(surface, skew)
+        ltl.operators.elliptic_stencil(surface, skew)
     with pytest.raises(ValueError, match="chosen on the host"):
-        jax.jit(lambda s: ltl.elliptic_stencil(s, 1.0)(s.vertices))(surface)
+        jax.jit(lambda s: ltl.operators.elliptic_stencil(s, 1.0)(s.vertices))(surface)
 
 
 def test_conduction_is_div_g_grad():

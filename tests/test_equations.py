@@ -21,7 +21,7 @@ def no_reaction(count):
 def test_fields_and_stencils_of_one_value_are_as_good_as_the_number(sphere):
     u = jnp.stack([sphere.vertices[:, 0], sphere.vertices[:, 1] ** 2], axis=1)
     field = 0.3 * jnp.ones(sphere.num_vertices)
-    stencil = ltl.elliptic_stencil(sphere, 0.2)
+    stencil = ltl.operators.elliptic_stencil(sphere, 0.2)
     kinetics = ltl.kinetics.schnakenberg()
     whole = ltl.ReactionDiffusion((field, stencil), kinetics)
     plain = ltl.ReactionDiffusion((0.3, 0.2), kinetics)
@@ -48,7 +48,7 @@ def test_a_flow_carries_a_field_around_the_sphere():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(4))
     x, y, z = surface.vertices.T
     velocity = jnp.stack([-y, x, 0 * z], axis=1)
-    stencil = ltl.elliptic_stencil(surface, 0.01, -velocity)
+    stencil = ltl.operators.elliptic_stencil(surface, 0.01, -velocity)
     equation = ltl.ReactionDiffusion((stencil,), no_reaction(1))
     u = ltl.solve(equation, surface, x[:, None], np.pi / 2, rtol=1e-6, atol=1e-8).u_end[:, 0]
     expected = y * np.exp(-2 * 0.01 * np.pi / 2)
@@ -61,9 +61,9 @@ def test_stripes_follow_a_direction_field():
     surface = ltl.Surface.from_mesh(mesh)
     x, y, z = surface.vertices.T
     field = jnp.stack([-y, x, 0 * z], axis=1)
-    tensor = ltl.direction_tensor(surface, field, along=1.6, across=0.4)
+    tensor = ltl.operators.direction_tensor(surface, field, along=1.6, across=0.4)
     # Of one species alone: with both the pattern would be stretched, and keep no direction.
-    spreads = (ltl.elliptic_stencil(surface, 0.516 * 0.0045 * tensor), 0.0045)
+    spreads = (ltl.operators.elliptic_stencil(surface, 0.516 * 0.0045 * tensor), 0.0045)
     kinetics = ltl.kinetics.barrio(cubic=3.5, quadratic=0.0)
     u0 = jnp.asarray(np.random.default_rng(0).uniform(-0.5, 0.5, (surface.num_vertices, 2)))
     u = ltl.solve(ltl.ReactionDiffusion(spreads, kinetics), surface, u0, 300.0, rtol=1e-3, atol=1e-4).u_end[:, 0]
@@ -211,7 +211,7 @@ def test_both_means_of_a_smooth_conductivity_are_of_the_same_order():
 
 
 @pytest.mark.parametrize(
-    "function", [ltl.laplacian, ltl.gradient, ltl.hessian, ltl.integrate, ltl.poisson, ltl.rotated_gradient]
+    "function", [ltl.laplacian, ltl.gradient, ltl.hessian, ltl.integrate, ltl.poisson, ltl.vectors.rotated_gradient]
 )
 def test_operators_refuse_masked_fields(function):
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))

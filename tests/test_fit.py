@@ -14,7 +14,7 @@ import ltljax as ltl
 TIMES = np.array([0.2, 0.4, 0.6])
 TRUTH = dict(a=0.1, b=0.9, d=10.0)
 AWAY = dict(a=0.13, b=0.7, d=7.0)
-RANGES = dict(a=ltl.Positive(), d=ltl.Positive())
+RANGES = dict(a=ltl.inverse.Positive(), d=ltl.inverse.Positive())
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def bumpy(surface, seed=0):
 def schnakenberg(surface, **how):
     """A Schnakenberg run whose rates a and b and diffusivity d are unknown."""
     u0 = np.array([1.0, 0.9]) + 0.1 * bumpy(surface)[:, None] * np.array([1.0, -1.0])
-    return ltl.Experiment(
+    return ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0)),
         surface, u0, **how,
     )  # fmt: skip
@@ -78,7 +78,9 @@ def test_an_optimiser_of_optax_serves_as_method(rates):
     start = {key: 1.02 * value for key, value in TRUTH.items()}
     data = ltl.Observations(values, level, TIMES)
     with jax.numpy_dtype_promotion("standard"):  # which optax counts on
-        found = ltl.fit(experiment, start, data, transforms=ltl.Positive(), method=optax.adam(5e-3), max_steps=60)
+        found = ltl.fit(
+            experiment, start, data, transforms=ltl.inverse.Positive(), method=optax.adam(5e-3), max_steps=60
+        )
     assert found.method.startswith("optax")
     assert found.loss < 0.01 * found.losses[0]
     assert relative(found.params, TRUTH) < 0.01
@@ -114,7 +116,7 @@ def test_the_covariance_is_that_of_repeated_experiments(sphere):
     np.testing.assert_allclose(found.covariance, 0.01 * np.linalg.inv(design.T @ design), rtol=1e-6, atol=1e-12)
     # Repeated with other noise, all at once.
     values = clean + 0.1 * np.random.default_rng(0).normal(size=(400, len(clean)))
-    many = ltl.fit_many(model, start, data, values=values)
+    many = ltl.inverse.fit_many(model, start, data, values=values)
     assert many.converged.all()
     spread = np.concatenate([many.params["c"], many.params["k"][:, None]], axis=1).std(axis=0)
     np.testing.assert_allclose(spread, found.evidence.std, rtol=0.15)
@@ -131,7 +133,7 @@ def test_what_data_cannot_tell_is_named(sphere):
     truth = dict(rate=30.0, spread=1.0, time=0.3)
     values, level = noisy(model(jax.tree.map(jnp.asarray, truth)), 0.01, 0)
     start = dict(rate=27.0, spread=1.1, time=0.32)
-    found = ltl.fit(model, start, ltl.Observations(values, level), transforms=ltl.Positive())
+    found = ltl.fit(model, start, ltl.Observations(values, level), transforms=ltl.inverse.Positive())
     # All rates times s and the time over s is the same run.
     [said] = found.evidence.cannot_tell
     for part in ("rate +10 %", "spread +10 %", "time -10 %", "not seen at all"):
@@ -141,7 +143,7 @@ def test_what_data_cannot_tell_is_named(sphere):
     # With the time known nothing is in doubt.
     known = ltl.fit(
         lambda p, adjoint=None: model({**p, "time": jnp.array(0.3)}, adjoint),
-        dict(rate=27.0, spread=1.1), ltl.Observations(values, level), transforms=ltl.Positive(),
+        dict(rate=27.0, spread=1.1), ltl.Observations(values, level), transforms=ltl.inverse.Positive(),
     )  # fmt: skip
     assert not known.evidence.cannot_tell
     assert "determine every parameter" in known.summary()
@@ -160,9 +162,9 @@ def test_what_shows_by_the_length_of_steps_alone_is_no_information(sphere):
     Derivatives see that length, so the singular value of d is not zero; it is below what adaptive steps may err by.
     """
     u0 = np.array([1.5, 0.5]) + 0 * bumpy(sphere)[:, None]
-    experiment = ltl.Experiment(schnakenberg(sphere).equation, sphere, u0)
+    experiment = ltl.inverse.Experiment(schnakenberg(sphere).equation, sphere, u0)
     data = ltl.Observations(experiment(TRUTH, TIMES).us, 1e-3, TIMES)
-    found = ltl.fit(experiment, AWAY, data, transforms=ltl.Positive())
+    found = ltl.fit(experiment, AWAY, data, transforms=ltl.inverse.Positive())
     assert found.singular_values[-1] < 1e-3 * found.singular_values[0]
     assert "d alone" in found.summary()
     [said] = found.evidence.cannot_tell
@@ -251,7 +253,7 @@ def test_many_starts_run_at_once_and_find_the_same(rates):
     starts = {key: value * (1 + 0.15 * rng.uniform(-1, 1, 4)) for key, value in TRUTH.items()}
     seen = np.arange(0, 642, 5)
     data = ltl.Observations(clean[:, seen], times=TIMES, vertices=seen)
-    many = ltl.fit_many(experiment, starts, data, transforms=RANGES)
+    many = ltl.inverse.fit_many(experiment, starts, data, transforms=RANGES)
     assert many.losses.shape == (4,)
     for k in range(4):
         assert relative({key: leaf[k] for key, leaf in many.params.items()}, TRUTH) < 1e-3
@@ -265,10 +267,10 @@ def test_a_search_begins_where_the_loss_has_many_valleys():
     data = ltl.Observations(np.sin(2.7 * x), 0.1)
     alone = ltl.fit(model, dict(k=5.0), data)
     assert abs(float(alone.params["k"]) - 2.7) > 0.1
-    starts, losses = ltl.explore(model, dict(k=0.5), dict(k=8.0), data, count=64)
+    starts, losses = ltl.inverse.explore(model, dict(k=0.5), dict(k=8.0), data, count=64)
     assert losses[0] == losses.min()
     assert starts["k"].shape == (8,)
-    assert ltl.fit_many(model, starts, data).best["k"] == pytest.approx(2.7, abs=1e-4)
+    assert ltl.inverse.fit_many(model, starts, data).best["k"] == pytest.approx(2.7, abs=1e-4)
 
 
 def test_rates_are_found_from_statistics_of_a_pattern(sphere):
@@ -279,13 +281,13 @@ def test_rates_are_found_from_statistics_of_a_pattern(sphere):
         u0 = np.array([1.0, 0.9]) + 0.1 * bumpy(surface, seed)[:, None] * np.array([1.0, -1.0])
         equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=60.0))
         u = ltl.solve(equation, surface, u0, 2.0, adjoint=adjoint, throw=False).u_end
-        return ltl.pattern_statistics(surface, u[:, 0], mass).vector[:3]
+        return ltl.inverse.pattern_statistics(surface, u[:, 0], mass).vector[:3]
 
     truth = dict(a=0.1, b=0.9)
     seen = np.mean([statistics(truth, seed) for seed in range(2, 8)], axis=0)
     spread = np.std([statistics(truth, seed) for seed in range(2, 8)], axis=0)
     start = dict(a=0.13, b=0.8)
-    found = ltl.fit(statistics, start, ltl.Observations(seen, spread), transforms=ltl.Positive())
+    found = ltl.fit(statistics, start, ltl.Observations(seen, spread), transforms=ltl.inverse.Positive())
     assert relative(found.params, truth) < 0.1
     low, high = found.intervals
     assert all(low[key] < truth[key] < high[key] for key in truth)
@@ -293,7 +295,7 @@ def test_rates_are_found_from_statistics_of_a_pattern(sphere):
 
 def test_a_histogram_is_the_coverage_between_levels(sphere):
     u, mass = sphere.vertices[:, 2], sphere.mass
-    found = ltl.pattern_statistics(sphere, u, mass, levels=[-0.5, 0.0, 0.5], softness=0.02)
+    found = ltl.inverse.pattern_statistics(sphere, u, mass, levels=[-0.5, 0.0, 0.5], softness=0.02)
     # Heights on a sphere are distributed evenly (Archimedes).
     np.testing.assert_allclose(found.histogram, [0.25, 0.25, 0.25, 0.25], atol=0.02)
     assert float(found.histogram.sum()) == pytest.approx(1)
@@ -303,16 +305,19 @@ def test_a_histogram_is_the_coverage_between_levels(sphere):
 def test_the_statistics_tell_spots_from_holes_and_are_differentiable(sphere):
     x, mass = sphere.vertices, sphere.mass
     spots = jnp.exp(8 * (x[:, 2] - 1))
-    found = ltl.pattern_statistics(sphere, spots, mass, levels=[0.1, 0.5])
+    found = ltl.inverse.pattern_statistics(sphere, spots, mass, levels=[0.1, 0.5])
     assert found.skewness > 1
-    assert ltl.pattern_statistics(sphere, -spots, mass).skewness < -1
+    assert ltl.inverse.pattern_statistics(sphere, -spots, mass).skewness < -1
     # The share of a cap: (1 - cos) / 2.
     np.testing.assert_allclose(found.coverage, [np.log(10) / 16, np.log(2) / 16], rtol=0.1)
-    first = ltl.pattern_statistics(sphere, x[:, 0], mass)
+    first = ltl.inverse.pattern_statistics(sphere, x[:, 0], mass)
     assert first.wavelength == pytest.approx(2 * np.pi / np.sqrt(2), rel=0.01)
     assert first.deviation == pytest.approx(np.sqrt(1 / 3), rel=0.01)
     check_grads(
-        lambda u: ltl.pattern_statistics(sphere, u, mass, levels=[0.1]).vector, (spots,), order=1, modes=["fwd", "rev"]
+        lambda u: ltl.inverse.pattern_statistics(sphere, u, mass, levels=[0.1]).vector,
+        (spots,),
+        order=1,
+        modes=["fwd", "rev"],
     )
 
 
@@ -327,10 +332,10 @@ def test_a_source_of_two_bumps_is_found_from_a_noisy_stationary_state(sphere):
         return ltl.fit(
             lambda p: ltl.screened_poisson(sphere, p["source"], 1.0),
             dict(source=np.zeros(len(x))) if start is None else start, data,
-            penalty=lambda p: ltl.smoothness(sphere, p["source"], weight, mass), max_steps=400,
+            penalty=lambda p: ltl.inverse.smoothness(sphere, p["source"], weight, mass), max_steps=400,
         )  # fmt: skip
 
-    weight, found, curve = ltl.choose_weight(with_weight, [1000.0, 300.0, 100.0, 30.0, 10.0, 3.0])
+    weight, found, curve = ltl.inverse.choose_weight(with_weight, [1000.0, 300.0, 100.0, 30.0, 10.0, 3.0])
     assert "L-BFGS" in found.method
     source = np.asarray(found.params["source"])
     assert np.linalg.norm(source - truth) < 0.15 * np.linalg.norm(truth)
@@ -348,7 +353,7 @@ def test_a_discrepancy_that_no_weight_reaches_is_said_to_be_missed():
         return ltl.fit(lambda p: p * x, 1.0, ltl.Observations(x**2 + 1, 0.01), penalty=lambda p: weight * p)
 
     with pytest.warns(UserWarning, match="No weight down to 0.1 explains the data"):
-        weight, _, _ = ltl.choose_weight(with_weight, [1.0, 0.1])
+        weight, _, _ = ltl.inverse.choose_weight(with_weight, [1.0, 0.1])
     assert weight == 0.1
 
 
@@ -369,11 +374,11 @@ def test_the_l_curve_bends_at_a_good_weight():
 
     weights = np.geomspace(1e-4, 1e6, 11)
     errors = [np.linalg.norm(with_weight(w, None).params - truth) for w in weights]
-    chosen, found, _ = ltl.choose_weight(with_weight, weights, rule="l-curve")
+    chosen, found, _ = ltl.inverse.choose_weight(with_weight, weights, rule="l-curve")
     assert chosen in weights
     assert np.linalg.norm(found.params - truth) < 3 * min(errors)
     with pytest.raises(ValueError, match="'discrepancy' or 'l-curve'"):
-        ltl.choose_weight(with_weight, weights, rule="gcv")
+        ltl.inverse.choose_weight(with_weight, weights, rule="gcv")
 
 
 def test_total_variation_keeps_a_step_that_smoothness_blurs(sphere):
@@ -386,28 +391,30 @@ def test_total_variation_keeps_a_step_that_smoothness_blurs(sphere):
         found = ltl.fit(lambda p: p, values, data, penalty=penalty, max_steps=300)
         return np.linalg.norm(found.params - truth)
 
-    sharp = min(denoised(lambda p, w=w: ltl.total_variation(sphere, p, w, mass=mass)) for w in (100.0, 300.0))
-    smooth = min(denoised(lambda p, w=w: ltl.smoothness(sphere, p, w, mass)) for w in (3.0, 10.0, 30.0))
+    sharp = min(denoised(lambda p, w=w: ltl.inverse.total_variation(sphere, p, w, mass=mass)) for w in (100.0, 300.0))
+    smooth = min(denoised(lambda p, w=w: ltl.inverse.smoothness(sphere, p, w, mass)) for w in (3.0, 10.0, 30.0))
     assert sharp < 0.75 * smooth
 
 
 def test_an_initial_state_is_found_from_a_later_noisy_one(sphere):
     x = np.asarray(sphere.vertices)
     truth = x[:, 0] + 0.5 * x[:, 1] * x[:, 2]
-    experiment = ltl.Experiment(lambda p: ltl.Diffusion(), sphere, lambda p: p, t1=0.05, dt=0.01, solver=ltl.TRBDF2())
+    experiment = ltl.inverse.Experiment(
+        lambda p: ltl.Diffusion(), sphere, lambda p: p, t1=0.05, dt=0.01, solver=ltl.TRBDF2()
+    )
     values, level = noisy(experiment(truth).u_end, 0.02, 0)
 
     def with_weight(weight, start):
         return ltl.fit(
             experiment, np.zeros(len(x)) if start is None else start, ltl.Observations(values, level),
-            penalty=lambda p: ltl.smoothness(sphere, p, weight, order=2), max_steps=150,
+            penalty=lambda p: ltl.inverse.smoothness(sphere, p, weight, order=2), max_steps=150,
         )  # fmt: skip
 
-    _, found, _ = ltl.choose_weight(with_weight, [1000.0, 100.0, 10.0, 1.0])
+    _, found, _ = ltl.inverse.choose_weight(with_weight, [1000.0, 100.0, 10.0, 1.0])
     assert "reverse mode with checkpoints" in found.method
     assert np.linalg.norm(found.params - truth) < 0.05 * np.linalg.norm(truth)
     with pytest.raises(ValueError, match="order 1"):
-        ltl.smoothness(sphere, truth, order=3)
+        ltl.inverse.smoothness(sphere, truth, order=3)
 
 
 def test_boundary_data_are_found_inside():
@@ -480,11 +487,11 @@ def test_a_diverging_trial_step_is_rejected(explosive, method):
 
 def test_a_start_that_fails_is_said_to(explosive):
     model, data, _ = explosive
-    with pytest.raises(ltl.FitError, match="fails at the start"):
+    with pytest.raises(ltl.errors.FitError, match="fails at the start"):
         ltl.fit(model, dict(r=2.0), data)
-    with pytest.raises(ltl.FitError, match="no finite derivatives"):
+    with pytest.raises(ltl.errors.FitError, match="no finite derivatives"):
         ltl.fit(lambda p: jnp.sqrt(p) * jnp.ones(3), 0.0, ltl.Observations(np.ones(3)))
-    many = ltl.fit_many(model, dict(r=np.array([0.1, 2.0])), data)
+    many = ltl.inverse.fit_many(model, dict(r=np.array([0.1, 2.0])), data)
     assert many.converged.tolist() == [True, False]
     assert np.isfinite(many.losses).tolist() == [True, False]
     assert float(many.best["r"]) == pytest.approx(0.9, abs=1e-3)
@@ -561,14 +568,14 @@ def test_a_fit_goes_on_from_what_was_kept_whatever_the_start_and_refuses_what_an
     start = dict(a=1.0, b=1.0)
     for other, message in (
         (dict(data=ltl.Observations(3 * x + 4, 0.2)), "its data differ"),
-        (dict(transforms=ltl.Positive()), "its ranges of parameters differ"),
+        (dict(transforms=ltl.inverse.Positive()), "its ranges of parameters differ"),
         (dict(model=lambda p: p["a"] * x + p["b"]), "its loss was"),
         (dict(penalty=lambda p: p["a"]), "its loss was"),
     ):
-        with pytest.raises(ltl.RestartError, match=f"holds another fit: {message}"):
+        with pytest.raises(ltl.errors.RestartError, match=f"holds another fit: {message}"):
             ltl.fit(**(dict(model=model, start=start, data=data, checkpoint=kept, resume=True) | other))
     kept.write_bytes(b"PK no zip")
-    with pytest.raises(ltl.RestartError, match="damaged"):
+    with pytest.raises(ltl.errors.RestartError, match="damaged"):
         ltl.fit(model, start, data, checkpoint=kept, resume=True)
 
 
@@ -630,17 +637,17 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
     with pytest.raises(ValueError, match="a to be positive"):
         ltl.fit(experiment, {**AWAY, "a": -1.0}, ltl.Observations(clean, times=TIMES), transforms=RANGES)
     with pytest.raises(ValueError, match="no parameter 'c'"):
-        ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), transforms=dict(c=ltl.Positive()))
+        ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), transforms=dict(c=ltl.inverse.Positive()))
     with pytest.raises(ValueError, match="to be a float"):
         ltl.fit(experiment, {**AWAY, "a": 1}, ltl.Observations(clean, times=TIMES))
     with pytest.raises(ValueError, match=r"method of optimistix .* or an optimiser of optax, found 'lm'"):
         ltl.fit(experiment, AWAY, ltl.Observations(clean, times=TIMES), method="lm")
     with pytest.raises(ValueError, match="low < high"):
-        ltl.Bounded(1.0, 1.0)
+        ltl.inverse.Bounded(1.0, 1.0)
     with pytest.raises(ValueError, match="has only one"):
         ltl.fit(lambda p: p * bumpy(sphere), 1.0, ltl.Observations(bumpy(sphere), species=0))
     with pytest.raises(ValueError, match=r"inf at index \(0, 1\)"):
-        ltl.fit_many(
+        ltl.inverse.fit_many(
             lambda p: p * jnp.ones(3), 1.0, ltl.Observations(np.ones(3)), values=np.where(np.eye(2, 3, 1), np.inf, 1.0)
         )
     # A model without an adjoint can be differentiated in reverse alone.
@@ -652,21 +659,25 @@ def test_data_that_do_not_fit_the_model_are_refused(sphere, rates):
 def test_bounded_parameters_stay_between_their_bounds():
     x = np.linspace(0, 1, 20)
     found = ltl.fit(
-        lambda p: p * jnp.asarray(x), 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0), max_steps=30
+        lambda p: p * jnp.asarray(x),
+        0.5,
+        ltl.Observations(2 * x, 0.1),
+        transforms=ltl.inverse.Bounded(0.0, 1.0),
+        max_steps=30,
     )
     assert 0.99 < float(found.params) <= 1
 
 
 def test_a_parameter_that_ran_to_its_bound_is_said_to_have():
     x = jnp.linspace(0.0, 1.0, 20)
-    found = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(1.02 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    found = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(1.02 * x, 0.1), transforms=ltl.inverse.Bounded(0.0, 1.0))
     assert 1 - 1e-4 < float(found.params) <= 1
     assert "parameter has run to the end of its range" in found.summary()
     assert np.isfinite(found.evidence.singular_values).all()
-    spent = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    spent = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(2 * x, 0.1), transforms=ltl.inverse.Bounded(0.0, 1.0))
     assert 1 - 1e-4 < float(spent.params) <= 1
     assert "has run to the end of its range" in spent.summary()
-    inside = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(0.9995 * x, 0.1), transforms=ltl.Bounded(0.0, 1.0))
+    inside = ltl.fit(lambda p: p * x, 0.5, ltl.Observations(0.9995 * x, 0.1), transforms=ltl.inverse.Bounded(0.0, 1.0))
     assert "determine every parameter" in inside.summary()
 
 
@@ -676,22 +687,22 @@ def test_a_right_gradient_passes_and_a_wrong_one_is_named(sphere):
     def loss(d):
         return jnp.sum(ltl.solve(ltl.Diffusion(d), sphere, x, 0.1, dt=0.01, throw=False).u_end ** 2)
 
-    right = ltl.check_gradient(loss, 1.0)
+    right = ltl.inverse.check_gradient(loss, 1.0)
     assert right.passed
     assert right.slope == pytest.approx(2, abs=0.1)
-    wrong = ltl.check_gradient(lambda d: loss(d) + loss(jax.lax.stop_gradient(d)), 1.0)
+    wrong = ltl.inverse.check_gradient(lambda d: loss(d) + loss(jax.lax.stop_gradient(d)), 1.0)
     assert not wrong.passed
     assert "wrong: slope 1.0" in str(wrong)
-    assert "linear" in ltl.check_gradient(lambda p: 3 * p["a"].sum(), dict(a=np.arange(3.0))).verdict
-    slightly = ltl.check_gradient(lambda p: jnp.sin(p) + 1e-3 * jax.lax.stop_gradient(p), 1.0)
+    assert "linear" in ltl.inverse.check_gradient(lambda p: 3 * p["a"].sum(), dict(a=np.arange(3.0))).verdict
+    slightly = ltl.inverse.check_gradient(lambda p: jnp.sin(p) + 1e-3 * jax.lax.stop_gradient(p), 1.0)
     assert not slightly.passed
     assert "right to 0.2 %, no better" in slightly.verdict
-    rounded = ltl.check_gradient(lambda p: jnp.sin(p) + 1e-4 * jnp.sin(1e7 * jax.lax.stop_gradient(p)), 1.0)
+    rounded = ltl.inverse.check_gradient(lambda p: jnp.sin(p) + 1e-4 * jnp.sin(1e7 * jax.lax.stop_gradient(p)), 1.0)
     assert "noisy" in rounded.verdict
     # In a session the table is what is shown.
     assert repr(wrong) == str(wrong)
     with pytest.raises(ValueError, match="one finite number"):
-        ltl.check_gradient(lambda p: jnp.log(p), -1.0)
+        ltl.inverse.check_gradient(lambda p: jnp.log(p), -1.0)
 
 
 @pytest.mark.parametrize(
@@ -704,7 +715,7 @@ def test_a_right_gradient_passes_and_a_wrong_one_is_named(sphere):
     ids=["float64", "float32", "constant"],
 )
 def test_a_loss_that_does_not_answer_shows_no_gradient_to_be_right(loss):
-    found = ltl.check_gradient(loss, 1.0)
+    found = ltl.inverse.check_gradient(loss, 1.0)
     assert not found.passed
     assert "does not answer to steps of this size" in found.verdict
 
@@ -719,7 +730,7 @@ IN_FULL = {"explicit", "SBDF2", "TRBDF2"}
 @pytest.mark.parametrize("name", [pytest.param(f, marks=[pytest.mark.slow] if f in IN_FULL else []) for f in FAMILIES])
 def test_gradients_of_free_vertices_pass_taylors_test(name):
     surface, (solver, dt) = ltl.Surface.from_mesh(ltl.shapes.icosphere(1)), FAMILIES[name]
-    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+    x, hierarchy = surface.vertices, ltl.solvers.multigrid(surface)
     u0 = jnp.cos(2 * x[:, 0]) + x[:, 1]
 
     def loss(vertices):
@@ -734,7 +745,7 @@ def test_gradients_of_free_vertices_pass_taylors_test(name):
         return jnp.sum(u**2 * jnp.cos(x[:, 2]))
 
     direction = 0.2 * np.random.default_rng(0).normal(size=x.shape)
-    found = ltl.check_gradient(loss, x, direction)
+    found = ltl.inverse.check_gradient(loss, x, direction)
     assert found.passed, found
     assert found.slope == pytest.approx(2, abs=0.1)
 
@@ -743,7 +754,7 @@ def test_gradients_of_free_vertices_pass_taylors_test(name):
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), ltl.RKL2(), ltl.TRBDF2()], ids=lambda s: type(s).__name__)
 def test_tangents_beside_adaptive_steps_pass_taylors_test(solver):
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
-    x, hierarchy = surface.vertices, ltl.multigrid(surface)
+    x, hierarchy = surface.vertices, ltl.solvers.multigrid(surface)
 
     @jax.jit
     def loss(p):

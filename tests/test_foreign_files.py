@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax.cli import main
-from ltljax.folder import OutputError
-from ltljax.output import files
+from ltljax._base.folder import OutputError
+from ltljax._output import files
+from ltljax.app.cli import main
 
 FITTED = """
 [mesh]

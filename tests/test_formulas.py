@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from ltljax.formulas import Formula, FormulaError, functions, parse
+from ltljax.app.scenario.formulas import Formula, FormulaError, functions, parse
 
 NAMES = ("a", "u", "v", "x", "y", "z")
 

@@ -7,11 +7,11 @@ import pytest
 
 import ltljax as ltl
 from ltljax import imaging
-from ltljax.imaging.tracing import mean_edge
-from ltljax.imaging.views import look
+from ltljax._imaging.flow.tracing import mean_edge
+from ltljax._imaging.flow.views import look
 
 # Of noisy meshes, which have a few.
-pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_fairing_divides_waves_by_what_it_says(sphere):
     # A sphere's own position is a harmonic of degree one: Delta X = -2 X.
     np.testing.assert_allclose(imaging.fair(sphere, 0.3)[:, 2:], z / (1 + 2 * 0.3), atol=2e-3)
     np.testing.assert_allclose(imaging.fair(sphere, 0.3, order=2)[:, 2:], z / (1 + 4 * 0.3), atol=2e-3)
-    with_multigrid = imaging.fair(sphere, 0.3, order=2, preconditioner=ltl.multigrid(sphere))
+    with_multigrid = imaging.fair(sphere, 0.3, order=2, preconditioner=ltl.solvers.multigrid(sphere))
     np.testing.assert_allclose(with_multigrid, imaging.fair(sphere, 0.3, order=2), atol=1e-8)
     both = jax.vmap(lambda strength: imaging.fair(sphere, strength, throw=False))(jnp.array([0.3, 0.6]))
     np.testing.assert_allclose(both[1], imaging.fair(sphere, 0.6), atol=1e-8)
@@ -187,7 +187,7 @@ def test_smoothed_positions_have_the_right_derivatives(sphere, way):
             smooth = imaging.fair(moved, amount, order=2, throw=False)
         return jnp.sum(jnp.sin(2 * smooth + 1))
 
-    found = ltl.check_gradient(loss, (x, 0.1))
+    found = ltl.inverse.check_gradient(loss, (x, 0.1))
     assert found.passed, found
 
 
@@ -239,7 +239,7 @@ def test_denoised_positions_have_the_right_derivatives(sphere):
     def loss(p):
         return jnp.sum(imaging.denoise_mesh(sphere.with_vertices(p[0]), p[1], normal_iterations=2) ** 3)
 
-    found = ltl.check_gradient(loss, (x, 0.35))
+    found = ltl.inverse.check_gradient(loss, (x, 0.35))
     assert found.passed, found
 
 
@@ -323,7 +323,7 @@ def test_lines_have_derivatives_in_the_field_and_means_along_them_in_forward_mod
         X = tangent(sphere, jnp.stack([-x[:, 1], x[:, 0], turn + 0.3 * x[:, 0]], axis=1))
         return jnp.sum(jnp.sin(imaging.streamlines(sphere, X, seeds, 0.7, 0.1).points))
 
-    found = ltl.check_gradient(loss, 0.3, step=1e-3)
+    found = ltl.inverse.check_gradient(loss, 0.3, step=1e-3)
     assert found.passed, found
 
     def smeared(noise):
@@ -378,7 +378,7 @@ def test_the_mean_along_lines_is_linear_in_the_noise_and_has_its_derivatives(sph
         return imaging.line_integral_convolution(sphere, X, noise=noise)
 
     np.testing.assert_allclose(smeared(0 * noise + 3), 3, rtol=1e-12)
-    found = ltl.check_gradient(lambda noise: jnp.sum(smeared(noise) ** 2), noise)
+    found = ltl.inverse.check_gradient(lambda noise: jnp.sum(smeared(noise) ** 2), noise)
     assert found.passed, found
     # A function of the height is the same all along a line.
     heights = sphere.vertices[:, 2]

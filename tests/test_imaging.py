@@ -9,12 +9,12 @@ import pytest
 
 import ltljax as ltl
 from ltljax import imaging
-from ltljax.imaging import minimiser
-from ltljax.imaging.minimiser import Faces, Functional
-from ltljax.imaging.variation import flatness
+from ltljax._imaging.images import minimiser
+from ltljax._imaging.images.minimiser import Faces, Functional
+from ltljax._imaging.images.variation import flatness
 
 # Two vertices of Spot have no consistent row.
-pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 SPOT = Path(__file__).parents[2] / "shared" / "meshes" / "spot_low.obj"
 NOISE = 0.1
 
@@ -153,7 +153,7 @@ def test_the_denoised_image_has_the_derivative_of_the_minimiser(sphere, what):
         return jnp.sum(sphere.surface.vertex_areas * x[:, 0] * u**2)
 
     start = {"strength": 0.01, "noise": 0.1, "data": sphere.noisy}[what]
-    found = ltl.check_gradient(loss, start, step=1e-3 if what == "data" else 1e-2)
+    found = ltl.inverse.check_gradient(loss, start, step=1e-3 if what == "data" else 1e-2)
     assert found.passed, found
     assert abs(found.slope - 2) < 0.1
     if what == "strength":
@@ -169,7 +169,7 @@ def test_the_denoised_image_has_a_derivative_in_the_vertices(sphere):
         )
         return jnp.sum(u**2 * sphere.x[:, 0])
 
-    found = ltl.check_gradient(loss, sphere.surface.vertices, step=1e-3)
+    found = ltl.inverse.check_gradient(loss, sphere.surface.vertices, step=1e-3)
     assert found.passed, found
     assert abs(found.slope - 2) < 0.1
 
@@ -244,7 +244,7 @@ def test_biharmonic_inpainting_is_of_higher_order():
 @pytest.mark.parametrize("method", ["tv", pytest.param("biharmonic", marks=pytest.mark.slow)])
 def test_inpainting_has_derivatives_in_the_known_values(sphere, method):
     mask = np.random.default_rng(5).uniform(size=len(sphere.x)) < 0.3
-    found = ltl.check_gradient(
+    found = ltl.inverse.check_gradient(
         lambda u: jnp.sum(imaging.inpaint(sphere.surface, u, mask, method) ** 2 * sphere.x[:, 0]),
         sphere.clean + 0.1 * sphere.x[:, 1],
         step=1e-3,
@@ -382,7 +382,7 @@ def test_two_regions_are_found_under_noise_that_thresholds_do_not_see_through(sp
 def test_the_phase_field_has_the_derivative_of_the_least_energy(spot):
     u = (spot.clean > 0.4) + 0.2 * np.random.default_rng(9).normal(size=len(spot.x))
     x, areas = spot.x[:, 0], spot.surface.vertex_areas
-    found = ltl.check_gradient(
+    found = ltl.inverse.check_gradient(
         lambda u: jnp.sum(areas * x * imaging.segment(spot.surface, u, tolerance=1e-11, throw=False).phi), u, step=1e-4
     )
     assert found.passed, found
@@ -498,7 +498,7 @@ def test_what_is_not_a_minimiser_has_its_derivative_too(sphere, name):
         image = everything(surface, u + change * x[:, 1], mask, turned, size, edge)[name]()
         return jnp.sum(weights.reshape(-1, *(1,) * (image.ndim - 1)) * (image + image**2))
 
-    found = ltl.check_gradient(loss, jnp.asarray(0.3), step=1e-2)
+    found = ltl.inverse.check_gradient(loss, jnp.asarray(0.3), step=1e-2)
     # Not the slope: adaptive steps are of other lengths for other images, which shows in the last digits.
     assert found.remainders[-1] < 1e-3 * found.differences[-1], found
 

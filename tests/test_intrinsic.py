@@ -11,8 +11,8 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 import ltljax as ltl
-from ltljax.lifting import support
-from ltljax.lifting.schemes import weigh
+from ltljax._lifting import support
+from ltljax._lifting.schemes import weigh
 
 
 def strip(n, degrees, amount=0.3, diagonals="random"):
@@ -76,7 +76,7 @@ def test_bending_changes_no_operator(degrees):
     # A flux through the rim, and a stencil with coefficients that vary.
     with_flux = [ltl.laplacian(surface, jnp.asarray(u), flux=jnp.asarray(X)) for surface in (bent, flat)]
     np.testing.assert_allclose(*with_flux, atol=1e-7)
-    stencils = [ltl.elliptic_stencil(surface, 1 + X).matrix() for surface in (bent, flat)]
+    stencils = [ltl.operators.elliptic_stencil(surface, 1 + X).matrix() for surface in (bent, flat)]
     assert largest_difference(*stencils) < 1e-9
 
 
@@ -155,7 +155,7 @@ def test_a_vector_that_is_parallel_across_a_crease_has_no_laplacian(scheme):
     across = np.where(x[:, None] < 1, [1.0, 0, 0], [0.0, 0, 1])
     across[np.isclose(x, 1)] = [np.sqrt(0.5), 0, np.sqrt(0.5)]
     np.testing.assert_allclose(ltl.vector_laplacian(surface, jnp.asarray(across)), 0, atol=1e-8)
-    np.testing.assert_allclose(ltl.covariant_derivative(surface, jnp.asarray(across)), 0, atol=1e-9)
+    np.testing.assert_allclose(ltl.vectors.covariant_derivative(surface, jnp.asarray(across)), 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("degree", [3, 4])
@@ -333,7 +333,7 @@ def test_rows_without_a_fit_are_cotangent_rows(monkeypatch):
 def test_the_stencil_of_the_laplacian_is_the_laplacian_also_at_cotangent_rows(make):
     surface = ltl.Surface.from_mesh(make())
     assert len(surface.report.cotangent) > 0
-    stencil = ltl.elliptic_stencil(surface, 2.0)
+    stencil = ltl.operators.elliptic_stencil(surface, 2.0)
     assert largest_difference(stencil.matrix(), 2 * ltl.laplacian_matrix(surface)) < 1e-9
     moved = stencil.with_coefficients(surface.with_vertices(2 * surface.vertices), 8.0)
     assert largest_difference(moved.matrix(), stencil.matrix()) < 1e-6

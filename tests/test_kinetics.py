@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import ltljax as ltl
-from ltljax.run import count_maxima
+from ltljax.app.run import count_maxima
 
 NAMES = [name for name in ltl.kinetics.__all__ if name.islower()]
 # Those whose species stay non-negative.
@@ -65,31 +64,31 @@ def test_a_reaction_without_a_known_steady_state_says_what_to_give():
     kinetics = ltl.kinetics.Kinetics(lambda u, p: (u[0] - u[1], u[1] - u[0] ** 3))
     with pytest.raises(ValueError, match="No steady state"):
         kinetics.steady_state()
-    found = ltl.dispersion(kinetics, (1.0, 1.0), (0.8, 0.9))
+    found = ltl.solvers.dispersion(kinetics, (1.0, 1.0), (0.8, 0.9))
     np.testing.assert_allclose(found.steady_state, (1, 1), atol=1e-10)
 
 
 def test_turks_band_at_gamma_12_is_the_one_known():
-    found = ltl.dispersion(ltl.kinetics.turk(rate=1.0), (0.8, 0.1))
+    found = ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.8, 0.1))
     np.testing.assert_allclose(found.band, (2.2, 22.8), atol=0.06)
     np.testing.assert_allclose(found.fastest, (8.2, 0.77), atol=0.06)
     assert found.forms_pattern
-    assert not ltl.dispersion(ltl.kinetics.turk(rate=1.0), (0.39, 0.1)).forms_pattern
-    assert ltl.dispersion(ltl.kinetics.turk(rate=1.0), (0.41, 0.1)).forms_pattern
+    assert not ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.39, 0.1)).forms_pattern
+    assert ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.41, 0.1)).forms_pattern
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_growth_rates_are_the_largest_eigenvalues_of_the_linearised_reaction(name):
     kinetics = getattr(ltl.kinetics, name)()
     diffusivity = 0.1 * 3.0 ** np.arange(len(kinetics.species))
-    found = ltl.dispersion(kinetics, diffusivity)
+    found = ltl.solvers.dispersion(kinetics, diffusivity)
     for eigenvalue in (0.0, 1.0, 7.5):
         matrix = np.asarray(found.jacobian) - eigenvalue * np.diag(diffusivity)
         np.testing.assert_allclose(found.growth(eigenvalue), np.linalg.eigvals(matrix).real.max(), atol=1e-9)
 
 
 def test_growth_rates_are_differentiable():
-    rate = lambda decay: ltl.dispersion(ltl.kinetics.turk(1.0, decay=decay), (0.8, 0.1)).growth(8.0)  # noqa: E731
+    rate = lambda decay: ltl.solvers.dispersion(ltl.kinetics.turk(1.0, decay=decay), (0.8, 0.1)).growth(8.0)  # noqa: E731
     assert jax.grad(rate)(12.0) == pytest.approx(float((rate(12.001) - rate(11.999)) / 0.002), rel=1e-5)
 
 
@@ -97,7 +96,7 @@ def test_growth_rates_are_differentiable():
 def test_seeded_harmonics_grow_at_the_exact_linear_rate(degree):
     sphere = ltl.Surface.from_mesh(ltl.shapes.icosphere(5))
     kinetics = ltl.kinetics.schnakenberg(rate=30.0)
-    found = ltl.dispersion(kinetics, (1.0, 10.0))
+    found = ltl.solvers.dispersion(kinetics, (1.0, 10.0))
     values, vectors = np.linalg.eig(np.asarray(found.jacobian) - degree * (degree + 1) * np.diag([1.0, 10.0]))
     first = values.real.argmax()
     assert values[first].imag == 0
@@ -111,7 +110,7 @@ def test_seeded_harmonics_grow_at_the_exact_linear_rate(degree):
 
 def test_noise_grows_at_the_wavelength_of_linear_theory(sphere):
     kinetics = ltl.kinetics.schnakenberg(rate=100.0)
-    found = ltl.dispersion(kinetics, (1.0, 10.0))
+    found = ltl.solvers.dispersion(kinetics, (1.0, 10.0))
     noise = jnp.asarray(np.random.default_rng(0).normal(size=(sphere.num_vertices, 2)))
     span = 8 / found.fastest[1]
     equation = ltl.ReactionDiffusion((1.0, 10.0), kinetics)

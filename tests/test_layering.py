@@ -9,91 +9,43 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "ltljax"
 
-# Each room, and the rooms of the package it may import.
-MAY_IMPORT = {
-    "mesh": set(),
-    "tables": set(),
-    "progress": set(),
-    "folder": set(),
-    "records": set(),
-    "conservation": set(),
-    "lifting": {"tables"},
-    "construction": {"mesh", "lifting", "tables", "progress"},
-    "surface": {"mesh", "lifting", "tables", "progress", "records", "conservation", "construction"},
-    "operators": {"surface", "tables"},
-    "curvature": {"surface", "construction", "lifting", "operators", "tables"},
-    "vectors": {"surface", "lifting", "operators", "curvature", "tables"},
-    "elliptic": {"surface", "construction", "lifting", "mesh", "operators", "tables", "progress"},
-    "formulas": set(),
-    "equations": {"elliptic", "operators", "surface", "tables", "vectors"},
-    "solve": {
-        "curvature",
-        "elliptic",
-        "equations",
-        "operators",
-        "surface",
-        "tables",
-        "lifting",
-        "mesh",
-        "progress",
-        "vectors",
-        "folder",
-    },
-    "imaging": {
-        "curvature",
-        "mesh",
-        "lifting",
-        "tables",
-        "surface",
-        "operators",
-        "vectors",
-        "elliptic",
-        "equations",
-        "solve",
-        "progress",
-        "output",
-    },
-    "fit": {"folder", "mesh", "equations", "operators", "surface", "tables", "solve", "progress", "output"},
-    "output": {"mesh"},
-    "show": {"mesh", "surface", "solve", "tables", "output"},
-    "scenario": {
-        "curvature",
-        "formulas",
-        "mesh",
-        "lifting",
-        "elliptic",
-        "equations",
-        "operators",
-        "surface",
-        "solve",
-        "output",
-    },
-    "run": {"folder", "scenario", "mesh", "lifting", "operators", "surface", "solve", "output", "progress"},
-    "recover": {"folder", "scenario", "fit", "lifting", "solve", "surface", "output", "progress"},
-    "process": {
-        "folder",
-        "curvature",
-        "mesh",
-        "lifting",
-        "operators",
-        "vectors",
-        "surface",
-        "solve",
-        "imaging",
-        "output",
-        "progress",
-    },
-    "cli": {"scenario", "process", "run", "recover", "fit", "mesh", "lifting", "solve"},
+# Each room, and the rooms of the package it may import: those before it in the data's way.
+ROOMS = [
+    "_base",
+    "_tables",
+    "_mesh",
+    "_lifting",
+    "_surface",
+    "_operators",
+    "_equations",
+    "_output",
+    "_solve",
+    "_show",
+    "_imaging",
+    "_fit",
+]
+# The public modules. Each lists names of the rooms; nothing but the application imports one.
+PUBLIC = ["errors", "imaging", "inverse", "io", "kinetics", "operators", "shapes", "solvers", "vectors"]
+# What a room does without, although it comes later.
+DOES_WITHOUT = {
+    "_tables": {"_base"},
+    "_mesh": {"_tables"},
+    "_lifting": {"_base", "_mesh"},
+    "_output": {"_tables", "_lifting", "_surface", "_operators", "_equations"},
 }
+MAY_IMPORT = {room: set(ROOMS[:place]) - DOES_WITHOUT.get(room, set()) for place, room in enumerate(ROOMS)}
+MAY_IMPORT |= {name: set(ROOMS) for name in PUBLIC}
+MAY_IMPORT["app"] = {*ROOMS, *PUBLIC}
+# These compute on the host, and do without JAX.
 NO_JAX = [
-    "mesh",
-    "output",
-    "construction.py",
-    "lifting/support.py",
-    "lifting/charts.py",
-    "lifting/delaunay.py",
-    "conservation.py",
-    "progress.py",
+    "_mesh",
+    "_output",
+    "_surface/building.py",
+    "_lifting/support.py",
+    "_lifting/charts.py",
+    "_lifting/delaunay.py",
+    "_surface/conservation.py",
+    "_base/progress.py",
 ]
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax.mesh import Mesh, MeshError, one_rings, shapes
-from ltljax.mesh.report import face_areas
+from ltljax._mesh import Mesh, MeshError, one_rings, shapes
+from ltljax._mesh.report import face_areas
 
 
 @pytest.fixture

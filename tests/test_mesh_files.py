@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from mesh_files import WRITERS, damaged
 
-from ltljax.mesh import Mesh, MeshError, load_mesh, one_rings, readers, shapes
-from ltljax.mesh.polygons import triangulated
+from ltljax._mesh import Mesh, MeshError, load_mesh, one_rings, readers, shapes
+from ltljax._mesh.polygons import triangulated
 
 
 def written(folder: Path, name: str, data: bytes | str) -> Path:

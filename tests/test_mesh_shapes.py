@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipeinc, ellipkinc
 
-from ltljax.mesh import Mesh, MeshError, shapes
+from ltljax._mesh import Mesh, MeshError, shapes
 
 # By name: a mesh at resolution n, the area, the Euler number, the lengths of the boundary loops in edges.
 SHAPES = {

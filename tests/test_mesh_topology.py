@@ -4,11 +4,10 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from ltljax.mesh import Mesh, k_ring, one_rings, shapes
-from ltljax.mesh.topology import OneRings, boundary_loops, unique_edges
+from ltljax._mesh import Mesh, k_ring, one_rings, shapes
+from ltljax._mesh.topology import OneRings, boundary_loops, unique_edges
 
 SHAPES = {
     "closed": shapes.icosphere(2),

@@ -9,8 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import ltljax as ltl
-from ltljax import scenario
-from ltljax.run import count_maxima
+from ltljax.app import scenario
+from ltljax.app.run import count_maxima
 
 
 @functools.cache
@@ -41,7 +41,7 @@ def halves(example, u):
 
 
 def wavelength(surface, u):
-    return float(ltl.pattern_statistics(surface, jnp.asarray(u), surface.mass).wavelength)
+    return float(ltl.inverse.pattern_statistics(surface, jnp.asarray(u), surface.mass).wavelength)
 
 
 # Isolated regions of the species shown: above or below the rest, and how many there are at least and at most.

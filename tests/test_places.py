@@ -3,12 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, given, settings, strategies as st
 
 import ltljax as ltl
 
-pytestmark = pytest.mark.filterwarnings("ignore::ltljax.FarFromOriginWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.FarFromOriginWarning")
 
 MAP = np.array([4e5, 5e6, 300.0])
 PLACES = st.tuples(*[st.floats(-7, 7).map(lambda power: np.sign(power) * 10 ** abs(power))] * 3).map(np.array)
@@ -62,13 +61,13 @@ def test_a_place_changes_no_number(scheme, place):
 
 
 def test_positions_of_a_far_mesh_are_relative_to_its_centre():
-    with pytest.warns(ltl.FarFromOriginWarning, match=r"surface\.centre, \(400000, 5e\+06, 300\)"):
+    with pytest.warns(ltl.errors.FarFromOriginWarning, match=r"surface\.centre, \(400000, 5e\+06, 300\)"):
         surface = surface_at(MAP)
     np.testing.assert_allclose(surface.vertices, SPHERE.vertices, atol=1e-6)
     # What is given or returned has the same centre; a mesh lies where the first one did.
     moved = surface.with_vertices(2 * surface.vertices)
     np.testing.assert_allclose(moved.vertex_areas, 4 * surface.vertex_areas, rtol=1e-4)
-    relief = ltl.displaced(surface, surface.vertices[:, 0], 0.1)
+    relief = ltl.imaging.displaced(surface, surface.vertices[:, 0], 0.1)
     np.testing.assert_allclose(relief.vertices.mean(axis=0), MAP, atol=0.1)
     flow = ltl.imaging.mean_curvature_flow(surface, 0.1)
     np.testing.assert_allclose(jnp.linalg.norm(flow, axis=1), np.sqrt(1 - 0.4), atol=0.02)
@@ -88,7 +87,7 @@ def test_a_mesh_near_the_origin_keeps_its_positions():
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "glb"])
 def test_files_of_a_far_mesh_keep_its_shape(tmp_path, kind):
-    from ltljax.output import files
+    from ltljax._output import files
 
     path, far, grey = tmp_path / f"far.{kind}", SPHERE.vertices + MAP, np.full((SPHERE.num_vertices, 4), 200, np.uint8)
     if kind == "obj":
@@ -101,8 +100,8 @@ def test_files_of_a_far_mesh_keep_its_shape(tmp_path, kind):
 
 
 def test_smoothing_a_file_at_map_coordinates_leaves_it_where_it_lies(tmp_path, capsys):
-    from ltljax.cli import main
-    from ltljax.output import files
+    from ltljax._output import files
+    from ltljax.app.cli import main
 
     path, out = tmp_path / "far.ply", tmp_path / "out"
     files.write_ply(path, SPHERE.vertices + MAP, SPHERE.faces, np.full((SPHERE.num_vertices, 3), 200, np.uint8))

@@ -158,8 +158,8 @@ def test_growing_modes_are_found_and_said_before_stepping():
     bad = ltl.Surface.from_mesh(ltl.shapes.random_sphere(642, seed=0), ltl.Polynomial(4))
     exact = np.linalg.eigvals(ltl.laplacian_matrix(bad).todense()).real.max()
     assert exact > 1
-    assert ltl.growth_rate(bad) == pytest.approx(exact, rel=1e-2)
-    with pytest.warns(ltl.GrowingModesWarning, match="grow like exp"):
+    assert ltl.operators.growth_rate(bad) == pytest.approx(exact, rel=1e-2)
+    with pytest.warns(ltl.errors.GrowingModesWarning, match="grow like exp"):
         ltl.solve(ltl.Diffusion(), bad, bad.vertices[:, 0], 1e-6)
     good = ltl.Surface.from_mesh(ltl.shapes.icosphere(3), ltl.Polynomial(4))
     x = np.asarray(good.vertices[:, 0])
@@ -168,7 +168,7 @@ def test_growing_modes_are_found_and_said_before_stepping():
 
 
 def test_a_mesh_too_coarse_for_the_fit_is_said():
-    with pytest.warns(ltl.InconsistentRowsWarning, match=r"At 12 vertices.*polynomial of degree 4.*subdivide"):
+    with pytest.warns(ltl.errors.InconsistentRowsWarning, match=r"At 12 vertices.*polynomial of degree 4.*subdivide"):
         ltl.Surface.from_mesh(ltl.shapes.icosphere(0), ltl.Polynomial(4))
 
 
@@ -189,10 +189,10 @@ def test_the_published_scheme_says_what_it_lacks():
 
 
 def test_a_mesh_on_which_a_fit_of_high_degree_does_not_pay_is_said():
-    with pytest.warns(ltl.CoarseMeshWarning, match=r"ltl\.Monotone\(\) was as accurate or more"):
+    with pytest.warns(ltl.errors.CoarseMeshWarning, match=r"ltl\.Monotone\(\) was as accurate or more"):
         ltl.Surface.from_mesh(ltl.shapes.torus(2.0, 1.0, 28, 14), ltl.Polynomial())
     with warnings.catch_warnings():
-        warnings.simplefilter("error", ltl.CoarseMeshWarning)
+        warnings.simplefilter("error", ltl.errors.CoarseMeshWarning)
         ltl.Surface.from_mesh(ltl.shapes.torus(2.0, 1.0, 80, 40), ltl.Polynomial())
         # A crease is no curvature of the smooth sides.
         ltl.Surface.from_mesh(ltl.shapes.box(n=8), ltl.Polynomial())

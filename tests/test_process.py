@@ -7,11 +7,12 @@ import pytest
 import trimesh
 
 import ltljax as ltl
-from ltljax import imaging, process
-from ltljax.cli import main
-from ltljax.mesh.columns import read_colors, read_columns
-from ltljax.output import files, pictures, texture
-from ltljax.process import images, results, subject
+from ltljax import imaging
+from ltljax._mesh.columns import read_colors, read_columns
+from ltljax._output import files, pictures, texture
+from ltljax.app import process
+from ltljax.app.cli import main
+from ltljax.app.process import images, results, subject
 
 COLORS = np.array([[0.9, 0.6, 0.2], [0.2, 0.4, 0.8]])
 NOISE = 0.1

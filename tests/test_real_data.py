@@ -11,9 +11,9 @@ import scipy.optimize
 import scipy.stats
 
 import ltljax as ltl
-from ltljax.cli import main
-from ltljax.fit.losses import as_loss
-from ltljax.fit.observations import root_of_deviance
+from ltljax._fit.losses import as_loss
+from ltljax._fit.observations import root_of_deviance
+from ltljax.app.cli import main
 
 TIMES = np.array([0.15, 0.45, 0.9])
 TRUTH = dict(a=0.12, b=0.85, dv=0.25)
@@ -31,7 +31,7 @@ def experiment(sphere):
     x = np.asarray(sphere.vertices)
     push = np.sin(5 * x[:, 0]) * np.cos(4 * x[:, 1]) + np.sin(6 * x[:, 2])
     u0 = jnp.asarray(np.array([0.97, 0.9]) + 0.3 * push[:, None] * np.array([1.0, -1.0]))
-    return ltl.Experiment(
+    return ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((0.02, p["dv"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=10.0)),
         sphere, u0,
     )  # fmt: skip
@@ -48,7 +48,7 @@ def noisy(exact, seed):
 
 def fitted(experiment, values, start=START, **options):
     data = ltl.Observations(values, times=TIMES, **options)
-    return ltl.fit(experiment, start, data, transforms=ltl.Positive())
+    return ltl.fit(experiment, start, data, transforms=ltl.inverse.Positive())
 
 
 def holds(found, truth=TRUTH):
@@ -98,7 +98,7 @@ def test_intervals_hold_the_truth_and_an_unknown_factor_of_each_species(experime
     held = np.zeros(5)
     factors = np.array([3.7, 0.2])
     for seed in SEEDS:
-        found = fitted(experiment, factors * noisy(exact, seed), scale=ltl.Positive(1.0))
+        found = fitted(experiment, factors * noisy(exact, seed), scale=ltl.inverse.Positive(1.0))
         assert found.converged
         low, high = found.evidence.ends
         truth = np.array([*TRUTH.values(), *factors])
@@ -110,7 +110,7 @@ def test_intervals_hold_the_truth_and_an_unknown_factor_of_each_species(experime
 def test_an_offset_and_a_background_are_found(experiment, exact, sphere):
     pattern = np.asarray(sphere.vertices)[:, 2:]
     values = noisy(exact, 0) + np.array([0.5, -0.2]) + np.array([0.1, 0.3]) * pattern
-    found = fitted(experiment, values, offset=ltl.Real(0.0), background=pattern)
+    found = fitted(experiment, values, offset=ltl.inverse.Real(0.0), background=pattern)
     assert holds(found).all()
     np.testing.assert_allclose(found.calibration["offset"], [0.5, -0.2], atol=0.01)
     np.testing.assert_allclose(found.calibration["background"], [0.1, 0.3], atol=0.01)
@@ -146,7 +146,7 @@ def test_a_far_start_is_recovered(experiment, exact, factor):
 
 def test_a_start_that_nothing_helps_is_not_called_converged(sphere):
     # The prediction does not depend on the parameter where the data are.
-    experiment = ltl.Experiment(lambda p: ltl.Diffusion(0 * p), sphere, jnp.ones(sphere.num_vertices))
+    experiment = ltl.inverse.Experiment(lambda p: ltl.Diffusion(0 * p), sphere, jnp.ones(sphere.num_vertices))
     values = 5 + np.random.default_rng(0).normal(size=(2, sphere.num_vertices))
     found = ltl.fit(experiment, 1.0, ltl.Observations(values, times=[0.1, 0.2]))
     assert found.status == "explains nothing"
@@ -270,7 +270,7 @@ def test_the_closest_point_is_that_of_a_search_over_all_triangles():
     mesh = ltl.shapes.jittered_torus(14, 7, 0.3, seed=0)
     surface = ltl.Surface.from_mesh(mesh)
     points = np.random.default_rng(0).uniform(-1.4, 1.4, size=(40, 3))
-    sampling = ltl.observe_at(surface, points, within=10.0)
+    sampling = ltl.inverse.observe_at(surface, points, within=10.0)
     found = np.asarray(sampling(surface.vertices)) + surface.centre
     corners = mesh.vertices[mesh.faces]
     grid = np.linspace(0, 1, 25)
@@ -290,7 +290,7 @@ def test_measurements_at_points_are_of_second_order():
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     for level in (2, 3, 4):
         surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
-        found = ltl.observe_at(surface, points)(jnp.sin(3 * surface.vertices[:, 0]))
+        found = ltl.inverse.observe_at(surface, points)(jnp.sin(3 * surface.vertices[:, 0]))
         errors.append(float(np.abs(found - np.sin(3 * points[:, 0])).max()))
         sizes.append(float(surface.mesh_size))
     assert np.polyfit(np.log(sizes), np.log(errors), 1)[0] > 1.8
@@ -301,7 +301,7 @@ def test_data_on_another_mesh_and_over_patches_recover_the_rates(experiment, exa
     other = ltl.shapes.icosphere(4).vertices[::3]
     patches = np.argmax(np.asarray(sphere.vertices) @ np.random.default_rng(0).normal(size=(3, 60)), axis=1)
     patches = np.unique(patches, return_inverse=True)[1]
-    for sampling in (ltl.observe_at(sphere, other), ltl.observe_patches(sphere, patches)):
+    for sampling in (ltl.inverse.observe_at(sphere, other), ltl.inverse.observe_patches(sphere, patches)):
         clean = np.asarray(sampling(exact, axis=1))
         found = fitted(experiment, noisy(clean, 0), operator=sampling)
         assert found.converged
@@ -312,8 +312,8 @@ def test_data_on_another_mesh_and_over_patches_recover_the_rates(experiment, exa
 def test_averages_over_patches_are_weighted_by_area(sphere):
     u, areas = 2 + np.asarray(sphere.vertices)[:, 2], np.asarray(sphere.vertex_areas)
     north = np.asarray(sphere.vertices)[:, 2] > 0
-    as_masks = ltl.observe_patches(sphere, [north, ~north])
-    as_numbers = ltl.observe_patches(sphere, np.where(north, 0, 1))
+    as_masks = ltl.inverse.observe_patches(sphere, [north, ~north])
+    as_numbers = ltl.inverse.observe_patches(sphere, np.where(north, 0, 1))
     expected = [np.average(u[part], weights=areas[part]) for part in (north, ~north)]
     np.testing.assert_allclose(as_masks(u), expected, rtol=1e-12)
     np.testing.assert_allclose(as_numbers(u), expected, rtol=1e-12)
@@ -352,13 +352,15 @@ def test_errors_that_stay_in_time_are_seen(experiment, exact):
 def test_every_state_of_a_fit_has_its_name(experiment, exact):
     values = noisy(exact, 0)
     assert fitted(experiment, values).status == "converged"
-    stopped = ltl.fit(experiment, START, ltl.Observations(values, times=TIMES), transforms=ltl.Positive(), max_steps=2)
+    stopped = ltl.fit(
+        experiment, START, ltl.Observations(values, times=TIMES), transforms=ltl.inverse.Positive(), max_steps=2
+    )
     assert (stopped.status, stopped.has_settled) == ("stopped", False)
     assert fitted(experiment, values, noise=NOISE / 5).status == "unexplained"
     # One of two factors cannot be told; and the best value lies beyond the range.
     flat = ltl.fit(lambda p: p["c"] * p["d"] * CURVE, dict(c=1.0, d=1.0), ltl.Observations(2 * CURVE, 0.1))
     assert flat.status == "undetermined"
-    low = ltl.fit(lambda p: p * CURVE, 0.5, ltl.Observations(2 * CURVE, 5.0), transforms=ltl.Bounded(0.0, 1.0))
+    low = ltl.fit(lambda p: p * CURVE, 0.5, ltl.Observations(2 * CURVE, 5.0), transforms=ltl.inverse.Bounded(0.0, 1.0))
     assert low.status == "end of range"
     assert [fit.converged for fit in (flat, low, stopped)] == [False] * 3
 
@@ -427,17 +429,17 @@ def test_the_unit_of_the_data_changes_units_only(factor, loss):
 def test_a_robust_fit_is_resumed_as_it_was_left(experiment, exact, tmp_path):
     values, _ = with_outliers(noisy(exact, 0), 0)
     data = ltl.Observations(values, times=TIMES, loss="huber")
-    options = dict(transforms=ltl.Positive(), checkpoint=tmp_path / "fit.npz")
+    options = dict(transforms=ltl.inverse.Positive(), checkpoint=tmp_path / "fit.npz")
     left = ltl.fit(experiment, START, data, stop_when=lambda step, *_: step == 8, **options)
     resumed = ltl.fit(experiment, START, data, resume=True, **options)
-    whole = ltl.fit(experiment, START, data, transforms=ltl.Positive())
+    whole = ltl.fit(experiment, START, data, transforms=ltl.inverse.Positive())
     assert resumed.converged
     assert left.num_steps == 9
     assert resumed.num_steps < whole.num_steps
     # Another model, whose loss there is another, is refused.
     ltl.fit(experiment, START, data, stop_when=lambda step, *_: step == 8, **options)
     other = dataclasses.replace(experiment, u0=1.05 * experiment.u0)
-    with pytest.raises(ltl.RestartError, match="holds another fit"):
+    with pytest.raises(ltl.errors.RestartError, match="holds another fit"):
         ltl.fit(other, START, data, resume=True, **options)
     for key in TRUTH:
         assert float(resumed.params[key]) == pytest.approx(float(whole.params[key]), rel=1e-3)
@@ -470,7 +472,10 @@ def test_the_chi_square_of_counts_is_one_however_low_the_rates():
         for seed in range(20):
             counts = np.random.default_rng(seed).poisson(rate, size=400)
             fit = ltl.fit(
-                lambda p: p * jnp.ones(400), rate, ltl.Observations(counts, "poisson"), transforms=ltl.Positive()
+                lambda p: p * jnp.ones(400),
+                rate,
+                ltl.Observations(counts, "poisson"),
+                transforms=ltl.inverse.Positive(),
             )
             sizes.append(fit.agreement.reduced_chi_square)
             low, high = fit.agreement.expected
@@ -498,26 +503,26 @@ def test_many_fits_and_searches_take_gaps_and_unknown_factors():
     sets = np.stack([np.exp(-CURVE), 3 * np.exp(-CURVE)])
     sets[:, ::7] = np.nan
     data = ltl.Observations(np.zeros(60), 0.1)
-    np.testing.assert_allclose(ltl.fit_many(line, 1.5, data, values=sets).params, [1, 3], rtol=1e-6)
+    np.testing.assert_allclose(ltl.inverse.fit_many(line, 1.5, data, values=sets).params, [1, 3], rtol=1e-6)
     masked = np.ma.masked_array(np.nan_to_num(sets, nan=99.0), np.isnan(sets))
-    np.testing.assert_allclose(ltl.fit_many(line, 1.5, data, values=masked).params, [1, 3], rtol=1e-6)
+    np.testing.assert_allclose(ltl.inverse.fit_many(line, 1.5, data, values=masked).params, [1, 3], rtol=1e-6)
     with pytest.raises(ValueError, match="Data set 1 has no value that was measured"):
-        ltl.fit_many(line, 1.5, data, values=np.stack([sets[0], np.full(60, np.nan)]))
+        ltl.inverse.fit_many(line, 1.5, data, values=np.stack([sets[0], np.full(60, np.nan)]))
     with pytest.raises(ValueError, match="takes the noise as given"):
-        ltl.fit_many(line, np.ones(2), ltl.Observations(sets[0], loss="huber"))
+        ltl.inverse.fit_many(line, np.ones(2), ltl.Observations(sets[0], loss="huber"))
     decay = lambda p: jnp.exp(-p * CURVE)  # noqa: E731
-    unknown = ltl.Observations(10 * np.exp(-CURVE), scale=ltl.Positive(1.0))
-    best, _ = ltl.explore(decay, 0.01, 100.0, unknown, count=128)
+    unknown = ltl.Observations(10 * np.exp(-CURVE), scale=ltl.inverse.Positive(1.0))
+    best, _ = ltl.inverse.explore(decay, 0.01, 100.0, unknown, count=128)
     assert 0.8 < float(best[0]) < 1.25
 
 
 def test_a_scan_keeps_bounded_parameters_near_their_start():
-    from ltljax.fit.problem import prepare
-    from ltljax.fit.scan import _moved
-    from ltljax.fit.unknowns import unknowns
+    from ltljax._fit.problem import prepare
+    from ltljax._fit.scan import _moved
+    from ltljax._fit.unknowns import unknowns
 
     start = dict(a=2.0, b=0.05, c=3.0)
-    space = unknowns(start, dict(a=ltl.Positive(), b=ltl.Bounded(0.0, 1.0)))
+    space = unknowns(start, dict(a=ltl.inverse.Positive(), b=ltl.inverse.Bounded(0.0, 1.0)))
     z = np.asarray(space.free((start, {})))
     model = lambda p: p["a"] * p["b"] * p["c"] * CURVE  # noqa: E731
     problem = prepare(model, space, ltl.Observations(CURVE), None, None, jnp.asarray(z), 1e-5, 1e-7)
@@ -532,7 +537,7 @@ def test_derivatives_do_not_see_what_was_not_measured():
     slope = jax.grad(lambda m: jnp.sum(data.misfit(m) ** 2))(jnp.array([2.0, -1.0]))
     np.testing.assert_allclose(slope, [2 * (1 - 3 / 2), 0.0], rtol=1e-6)
     assert ltl.Observations([1.0, 2.0], [0.1, np.nan], mask=[True, False]).num_values == 1
-    assert ltl.Observations([1.0], scale=ltl.Bounded(2.0, 5.0)).calibration.unknowns(1.0)["scale"][0] == 3.5
+    assert ltl.Observations([1.0], scale=ltl.inverse.Bounded(2.0, 5.0)).calibration.unknowns(1.0)["scale"][0] == 3.5
 
 
 REFUSED = [
@@ -550,7 +555,7 @@ REFUSED = [
     (dict(values=[1.0, -2.0], noise="poisson"), "Expected counts from 0"),
     (dict(values=[1.0, 2.0], relative_noise=0.1), "Expected noise= beside relative_noise="),
     (dict(values=[1.0, 2.0], scale=0.0), "Expected scale as a finite number other than zero"),
-    (dict(values=[1.0, 2.0], scale=ltl.Positive(-1.0)), "Expected the start of scale to be positive"),
+    (dict(values=[1.0, 2.0], scale=ltl.inverse.Positive(-1.0)), "Expected the start of scale to be positive"),
     (dict(values=[1.0, 2.0], offset="free"), "offset as real numbers"),
     (dict(values=[1.0, 2.0], background=np.zeros(2)), "Expected background as finite numbers, not all zero"),
     (dict(values=[1.0, 2.0], operator=np.ones(3)), r"Expected an operator as a matrix \(M, V\)"),
@@ -568,25 +573,30 @@ def test_data_that_cannot_be_used_are_refused(given, message):
 @pytest.mark.usefixtures("as_users_call_it")
 def test_points_and_patches_that_cannot_be_used_are_refused(sphere):
     with pytest.raises(ValueError, match=r"Point 1 at \(3, 0, 0\) is 2 from the surface, and 1 of 2 points"):
-        ltl.observe_at(sphere, np.array([[1.0, 0, 0], [3.0, 0, 0]]))
+        ltl.inverse.observe_at(sphere, np.array([[1.0, 0, 0], [3.0, 0, 0]]))
     with pytest.raises(ValueError, match="Point 0 is not finite"):
-        ltl.observe_at(sphere, np.full((1, 3), np.nan))
+        ltl.inverse.observe_at(sphere, np.full((1, 3), np.nan))
     with pytest.raises(ValueError, match=r"Expected points of shape \(M, 3\)"):
-        ltl.observe_at(sphere, np.zeros(3))
+        ltl.inverse.observe_at(sphere, np.zeros(3))
     with pytest.raises(ValueError, match="Patch 1 has no vertices"):
-        ltl.observe_patches(sphere, [[0, 1], []])
+        ltl.inverse.observe_patches(sphere, [[0, 1], []])
     with pytest.raises(ValueError, match="Patch 0 has vertices outside"):
-        ltl.observe_patches(sphere, [[0, 10_000]])
+        ltl.inverse.observe_patches(sphere, [[0, 10_000]])
     small = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
-    model = ltl.Experiment(ltl.Diffusion, small, small.vertices[:, 0])
-    data = ltl.Observations([[1.0]], times=[0.1], operator=ltl.observe_patches(sphere, [[0]]))
+    model = ltl.inverse.Experiment(ltl.Diffusion, small, small.vertices[:, 0])
+    data = ltl.Observations([[1.0]], times=[0.1], operator=ltl.inverse.observe_patches(sphere, [[0]]))
     with pytest.raises(ValueError, match="The operator reads 162 vertices; the model predicts"):
         ltl.fit(model, 1.0, data)
 
 
 def test_transforms_of_parameters_have_no_start_of_their_own():
     with pytest.raises(ValueError, match="Expected a transform without a start"):
-        ltl.fit(curve, dict(size=1.0, rate=1.0, floor=0.1), ltl.Observations(spoiled()), transforms=ltl.Positive(2.0))
+        ltl.fit(
+            curve,
+            dict(size=1.0, rate=1.0, floor=0.1),
+            ltl.Observations(spoiled()),
+            transforms=ltl.inverse.Positive(2.0),
+        )
 
 
 def rows(name, case_file, mesh):
@@ -601,7 +611,7 @@ def rows(name, case_file, mesh):
 def spot(real_mesh, case_file):
     mesh = ltl.load_mesh(real_mesh("spot_low.obj"))
     u0 = jnp.asarray(rows("schnakenberg_start.csv", case_file, mesh))
-    model = ltl.Experiment(
+    model = ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((0.02, p["dv"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=10.0)),
         # The operator that made the data.
         ltl.Surface.from_mesh(mesh, ltl.Monotone(lift="chord")), u0,
@@ -609,7 +619,7 @@ def spot(real_mesh, case_file):
     return model, lambda name: rows(name, case_file, mesh)
 
 
-@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+@pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 def test_the_shared_cases_give_the_rates(spot):
     model, read = spot
     clean = np.stack([read(f"schnakenberg_{k}.csv") for k in range(3)])
@@ -623,12 +633,12 @@ def test_the_shared_cases_give_the_rates(spot):
     named = {tuple(index) for index in robust.agreement.outliers}
     assert named == {tuple(index) for index in np.argwhere(np.abs(wrong - clean) > 1)}
     assert np.sum(np.abs(wrong - clean) > 1) == 25
-    scaled = fitted(model, 2.9 * clean, scale=ltl.Positive(1.0))
+    scaled = fitted(model, 2.9 * clean, scale=ltl.inverse.Positive(1.0))
     assert holds(scaled).all()
     np.testing.assert_allclose(scaled.calibration["scale"], 2.9, rtol=2e-3)
     # A few steps are enough to see it.
     data = ltl.Observations(2.9 * clean, times=TIMES)
-    lost = ltl.fit(model, START, data, transforms=ltl.Positive(), max_steps=10)
+    lost = ltl.fit(model, START, data, transforms=ltl.inverse.Positive(), max_steps=10)
     assert lost.summary().startswith("The model explains nothing")
 
 
@@ -694,7 +704,7 @@ def off(values, chance):
     ids=["calibration", "points", "patches", "operator and background"],
 )
 def test_a_scenario_file_fits_data_as_they_are_measured(tmp_path, options, where, spoil):
-    from ltljax import scenario
+    from ltljax.app import scenario
 
     text = SCENARIO.replace("OPTIONS", options)
     example = scenario.read(text.split("[fit]")[0], "mine", tmp_path)
@@ -703,11 +713,11 @@ def test_a_scenario_file_fits_data_as_they_are_measured(tmp_path, options, where
     order = np.asarray(example.mesh.source_order)
     if where == "points":
         points = np.asarray(ltl.shapes.icosphere(3).vertices)[::2]
-        states = np.asarray(ltl.observe_at(surface, points)(states, axis=1))
+        states = np.asarray(ltl.inverse.observe_at(surface, points)(states, axis=1))
         in_files(tmp_path, dict(zip("xyz", points.T, strict=True)), states, spoil)
     elif where == "patches":
         numbers = (8 * (np.arctan2(*np.asarray(surface.vertices)[:, :2].T) / np.pi + 1)).astype(int) % 16
-        states = np.asarray(ltl.observe_patches(surface, numbers)(states, axis=1))
+        states = np.asarray(ltl.inverse.observe_patches(surface, numbers)(states, axis=1))
         (tmp_path / "patches.csv").write_text("patch\n" + "\n".join(map(str, numbers[order])) + "\n")
         in_files(tmp_path, dict(patch=np.arange(16)), states, spoil)
     elif where == "sums":
@@ -732,7 +742,7 @@ def test_a_scenario_file_fits_data_as_they_are_measured(tmp_path, options, where
 
 
 def test_new_fit_prints_a_scenario_that_is_fitted(tmp_path, capsys):
-    from ltljax import scenario
+    from ltljax.app import scenario
 
     assert main(["new", "fit"]) == 0
     text = capsys.readouterr().out.replace("subdivisions = 3", "subdivisions = 2")
@@ -751,7 +761,7 @@ def test_the_picture_shows_where_the_loss_is_not_quadratic():
     early = np.linspace(0, 0.5, 12)
     model = lambda p: p["size"] * (1 - jnp.exp(-p["rate"] * early))  # noqa: E731
     values = 2 * (1 - np.exp(-early)) + 0.03 * np.random.default_rng(1).normal(size=12)
-    fit = ltl.fit(model, dict(size=2.0, rate=1.0), ltl.Observations(values, 0.03), transforms=ltl.Positive())
+    fit = ltl.fit(model, dict(size=2.0, rate=1.0), ltl.Observations(values, 0.03), transforms=ltl.inverse.Positive())
     steps = np.array([-2.0, 0.0, 2.0])
     rise = fit.losses_along("rate", steps) - fit.loss
     assert rise[1] == pytest.approx(0, abs=1e-9)

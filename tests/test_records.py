@@ -58,7 +58,7 @@ def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "arrays.npz", a=np.zeros(3))
     tree = dict(ltljax=1, record={"record": "os:system", "fields": {}})
     np.savez(tmp_path / "code.npz", tree=np.array(json.dumps(tree)))
-    tree["record"] = {"record": "ltljax.lifting.schemes:Monotone", "fields": {}}
+    tree["record"] = {"record": "ltljax._lifting.schemes:Monotone", "fields": {}}
     np.savez(tmp_path / "scheme.npz", tree=np.array(json.dumps(tree)))
     np.savez(tmp_path / "later.npz", tree=np.array(json.dumps(dict(tree, ltljax=99))))
     for name in ("text", "arrays", "code", "scheme", "later"):

@@ -30,7 +30,7 @@ def waves(surface):
 
 def schnakenberg(surface):
     u0 = np.array([1.0, 0.9]) + 0.1 * waves(surface)[:, None] * np.array([1.0, -1.0])
-    experiment = ltl.Experiment(
+    experiment = ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((1.0, p["d"]), ltl.kinetics.schnakenberg(p["a"], p["b"], rate=30.0)),
         surface, u0,
     )  # fmt: skip
@@ -39,7 +39,7 @@ def schnakenberg(surface):
 
 def gray_scott(surface):
     push = np.clip(waves(surface), 0, 1)
-    experiment = ltl.Experiment(
+    experiment = ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((2e-3, 1e-3), ltl.kinetics.gray_scott(p["feed"], p["kill"])),
         surface, np.stack([1 - 0.5 * push, 0.5 * push], axis=1),
     )  # fmt: skip
@@ -58,7 +58,7 @@ def errors(found, truth):
 def test_rates_are_recovered_from_clean_snapshots_30_percent_off(name, where):
     experiment, truth, start, times = PROBLEMS[name](built(where))
     data = ltl.Observations(experiment(truth, times).us, times=times)
-    found = ltl.fit(experiment, start, data, transforms=ltl.Positive())
+    found = ltl.fit(experiment, start, data, transforms=ltl.inverse.Positive())
     assert found.converged
     assert errors(found, truth) < 1e-3
 
@@ -74,7 +74,7 @@ def test_with_noise_of_one_percent_the_truth_is_in_the_interval(name, where):
     # From 30 % off once; then from what that gave, which is where each fit ends.
     for seed in range(20):
         values = clean + level * np.random.default_rng(seed).normal(size=clean.shape)
-        found = ltl.fit(experiment, start, ltl.Observations(values, level, times), transforms=ltl.Positive())
+        found = ltl.fit(experiment, start, ltl.Observations(values, level, times), transforms=ltl.inverse.Positive())
         assert errors(found, truth) < 0.03
         low, high = found.intervals
         start = found.params
@@ -95,7 +95,7 @@ def test_eight_unknowns_take_a_fifth_of_the_runs_that_finite_differences_take():
         kinetics = ltl.kinetics.schnakenberg(p["a"], p["b"] * jnp.exp(x @ p["tilt"]), rate=p["rate"])
         return ltl.ReactionDiffusion((p["du"], p["dv"]), kinetics)
 
-    experiment = ltl.Experiment(equation, surface, u0)
+    experiment = ltl.inverse.Experiment(equation, surface, u0)
     truth = dict(a=0.1, b=0.9, du=1.0, dv=10.0, rate=30.0, tilt=np.array([0.1, -0.05, 0.02]))
     start = dict(a=0.12, b=0.8, du=1.2, dv=8.5, rate=27.0, tilt=np.zeros(3))
     data = ltl.Observations(experiment(truth, times).us, times=times)
@@ -123,7 +123,7 @@ def test_a_source_of_two_bumps_is_found_on_a_rabbit():
         pytest.skip("the folder of real meshes is not at hand")
     mesh = ltl.load_mesh(MESHES / "bunny_closed.obj")
     mesh = mesh.scaled(np.sqrt(4 * np.pi / mesh.area))
-    with pytest.warns(ltl.InconsistentRowsWarning):  # eight of 3,301
+    with pytest.warns(ltl.errors.InconsistentRowsWarning):  # eight of 3,301
         surface = ltl.Surface.from_mesh(mesh)
     mass = surface.mass
     centres = [int(mesh.vertices[:, 1].argmax()), int(mesh.vertices[:, 0].argmin())]
@@ -137,10 +137,10 @@ def test_a_source_of_two_bumps_is_found_on_a_rabbit():
         return ltl.fit(
             lambda p: ltl.screened_poisson(surface, p["source"], 1.0),
             dict(source=np.zeros(len(truth))) if start is None else start, data,
-            penalty=lambda p: ltl.smoothness(surface, p["source"], weight, mass, order=2), max_steps=400,
+            penalty=lambda p: ltl.inverse.smoothness(surface, p["source"], weight, mass, order=2), max_steps=400,
         )  # fmt: skip
 
-    _, found, _ = ltl.choose_weight(with_weight, [300.0, 100.0, 30.0, 10.0, 3.0, 1.0])
+    _, found, _ = ltl.inverse.choose_weight(with_weight, [300.0, 100.0, 30.0, 10.0, 3.0, 1.0])
     source = np.asarray(found.params["source"])
     weight = np.asarray(mass)
     error = np.sqrt(weight @ (source - truth) ** 2 / (weight @ truth**2))
@@ -160,7 +160,7 @@ def small():
 @pytest.mark.parametrize("share", [0.0, 0.01])
 def test_rates_of_turk_are_recovered_from_snapshots(small, share):
     u0 = 4 + 0.3 * waves(small)[:, None] * np.array([1.0, -1.0])
-    experiment = ltl.Experiment(
+    experiment = ltl.inverse.Experiment(
         lambda p: ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turk(p["s"], p["alpha"], p["beta"])), small, u0
     )
     truth, times = dict(s=10.0, alpha=16.0, beta=12.0), np.array([0.02, 0.05, 0.1])
@@ -168,7 +168,9 @@ def test_rates_of_turk_are_recovered_from_snapshots(small, share):
     level = share * clean.std()
     values = clean + level * np.random.default_rng(0).normal(size=clean.shape)
     start = dict(s=13.0, alpha=12.8, beta=9.6)
-    found = ltl.fit(experiment, start, ltl.Observations(values, level or None, times), transforms=ltl.Positive())
+    found = ltl.fit(
+        experiment, start, ltl.Observations(values, level or None, times), transforms=ltl.inverse.Positive()
+    )
     assert found.converged
     assert errors(found, truth) < (0.01 if share else 1e-5)
     if share:
@@ -192,7 +194,7 @@ class Conduction(ltl.Equation):
 def test_a_diffusivity_field_is_found_with_tikhonovs_penalty_and_the_discrepancy_rule(small):
     x, mass = np.asarray(small.vertices), small.mass
     truth = 0.8 * np.exp(-((x - [0, 0, 1]) ** 2).sum(axis=1) / 0.5) - 0.5 * x[:, 0]
-    experiment = ltl.Experiment(
+    experiment = ltl.inverse.Experiment(
         lambda p: Conduction(jnp.exp(p["log"])), small, waves(small), dt=0.01, solver=ltl.RKL2()
     )
     times = np.array([0.02, 0.05, 0.1])
@@ -203,10 +205,10 @@ def test_a_diffusivity_field_is_found_with_tikhonovs_penalty_and_the_discrepancy
     def with_weight(weight, start):
         return ltl.fit(
             experiment, dict(log=np.zeros(len(x))) if start is None else start, data,
-            penalty=lambda p: ltl.smoothness(small, p["log"], weight, mass), max_steps=150,
+            penalty=lambda p: ltl.inverse.smoothness(small, p["log"], weight, mass), max_steps=150,
         )  # fmt: skip
 
-    weight, found, curve = ltl.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0])
+    weight, found, curve = ltl.inverse.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0])
     assert curve[-1, 1] <= data.values.size
     assert weight == curve[-1, 0] < 1000
     error = np.linalg.norm(found.params["log"] - truth) / np.linalg.norm(truth)
@@ -226,7 +228,7 @@ def test_free_vertices_give_a_stationary_field_a_wanted_value_and_the_mesh_stays
     """Every coordinate is free; what keeps triangles good is that neighbours are to move alike."""
     x, faces = small.vertices, np.asarray(small.faces)
     source, south = jnp.exp(-8 * (1 - x[:, 2])), int(jnp.argmin(x[:, 2]))
-    hierarchy = ltl.multigrid(small)
+    hierarchy = ltl.solvers.multigrid(small)
 
     def warmth(p):
         moved = small.with_vertices(x + p["move"])
@@ -235,7 +237,7 @@ def test_free_vertices_give_a_stationary_field_a_wanted_value_and_the_mesh_stays
     before = float(warmth(dict(move=0 * x)))
     found = ltl.fit(
         warmth, dict(move=np.zeros(x.shape)), ltl.Observations(1.3 * before, 1e-3 * before),
-        penalty=lambda p: [ltl.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_steps=80,
+        penalty=lambda p: [ltl.inverse.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_steps=80,
     )  # fmt: skip
     vertices = np.asarray(x + found.params["move"])
     anew = ltl.Surface.from_mesh(ltl.Mesh(vertices, faces))
@@ -255,13 +257,13 @@ def test_rates_are_found_from_wavelength_coverage_and_histogram_of_a_pattern(sma
         return ltl.solve(equation, small, u0, 2.0, adjoint=adjoint, throw=False).u_end[:, 0]
 
     def statistics(p, seed=1, adjoint=None):
-        found = ltl.pattern_statistics(small, state(p, seed, adjoint), mass, levels=[0.6, 1.0, 1.6])
+        found = ltl.inverse.pattern_statistics(small, state(p, seed, adjoint), mass, levels=[0.6, 1.0, 1.6])
         return jnp.concatenate([found.wavelength[None], found.histogram[:-1]])
 
     truth = dict(a=0.1, b=0.9)
     runs = np.array([statistics(truth, seed) for seed in range(2, 10)])
     data = ltl.Observations(runs.mean(axis=0), runs.std(axis=0))
-    found = ltl.fit(statistics, dict(a=0.12, b=0.85), data, transforms=ltl.Positive())
+    found = ltl.fit(statistics, dict(a=0.12, b=0.85), data, transforms=ltl.inverse.Positive())
     print(found)
     assert errors(found, truth) < 0.15
     low, high = found.intervals

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax import scenario
-from ltljax.folder import Folder
-from ltljax.solve.fingerprint import fingerprint
+from ltljax._base.folder import Folder
+from ltljax._solve.fingerprint import fingerprint
+from ltljax.app import scenario
 
 RUN = """
 import sys
@@ -128,7 +128,7 @@ def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, 
     surface = ltl.Surface.from_mesh(example.mesh)
     us = ltl.solve(example.make_equation(surface), surface, example.u0, 60.0).u_end
     np.savez(tmp_path / "seen.npz", u=1.01 * np.asarray(us[:, 0]), v=0.99 * np.asarray(us[:, 1]))
-    code = "import sys; from ltljax.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from ltljax.app.cli import main; sys.exit(main(sys.argv[1:]))"
 
     def begin(out, *more):
         changes = ["--set", "kinetics.feed=0.05", "--set", "diffusivity.u=3e-4"] if command == "fit" else []
@@ -192,7 +192,7 @@ def test_files_of_another_run_are_refused(case, tmp_path):
         "start": (equation, surface, u0 + 1, 1.0),
         "end": (equation, surface, u0, 2.0),
     }.items():
-        with pytest.raises(ltl.RestartError, match=f"another {name}"):
+        with pytest.raises(ltl.errors.RestartError, match=f"another {name}"):
             ltl.solve(*call, checkpoint_dir=tmp_path, resume=True)
 
 
@@ -214,7 +214,7 @@ def test_a_run_goes_on_from_before_what_is_damaged(case, tmp_path):
     asked.unlink()
     np.testing.assert_array_equal(run(resume=True).us, whole.us)
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(ltl.RestartError, match=r"run\.json was damaged"):
+    with pytest.raises(ltl.errors.RestartError, match=r"run\.json was damaged"):
         run(resume=True)
 
 
@@ -261,7 +261,7 @@ def test_a_run_that_has_not_ended_is_not_erased(case, tmp_path):
     states = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
     assert states
     with pytest.raises(
-        ltl.RestartError, match=r"holds a run that has not ended, at t = 0\.\d+\. Go on with resume=True"
+        ltl.errors.RestartError, match=r"holds a run that has not ended, at t = 0\.\d+\. Go on with resume=True"
     ):
         run()
     assert states == {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
@@ -369,12 +369,12 @@ def test_a_run_of_functions_without_a_source_needs_a_name(case, tmp_path):
     exec("def kinetics(s, p): return (-s[0],)", names)
     equation = ltl.ReactionDiffusion((0.1,), names["kinetics"])
     u0, how = u0[:, None], dict(checkpoint_dir=tmp_path, dt=0.1)
-    with pytest.raises(ltl.RestartError, match=r"source of the function kinetics is not available.*run_id"):
+    with pytest.raises(ltl.errors.RestartError, match=r"source of the function kinetics is not available.*run_id"):
         ltl.solve(equation, surface, u0, 0.2, **how)
     named = ltl.solve(equation, surface, u0, 0.2, run_id="decay", **how)
     again = ltl.solve(equation, surface, u0, 0.2, run_id="decay", resume=True, **how)
     np.testing.assert_array_equal(named.u_end, again.u_end)
-    with pytest.raises(ltl.RestartError, match="another equation"):
+    with pytest.raises(ltl.errors.RestartError, match="another equation"):
         ltl.solve(equation, surface, u0, 0.2, run_id="growth", resume=True, **how)
 
 
@@ -394,7 +394,7 @@ PRINT = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import test_restart as here
-from ltljax.solve.fingerprint import fingerprint
+from ltljax._solve.fingerprint import fingerprint
 print(fingerprint([here.tells_apart, here.Opaque(1.0), here.ltl.RKL2(), here.np.float32]))
 """
 
@@ -453,8 +453,8 @@ def test_states_without_their_description_are_neither_erased_nor_resumed(case, t
     run()
     states = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
     (tmp_path / "run.json").unlink()
-    with pytest.raises(ltl.RestartError, match="which says what run made them"):
+    with pytest.raises(ltl.errors.RestartError, match="which says what run made them"):
         run(resume=True)
-    with pytest.raises(ltl.RestartError, match="holds a run that has not ended"):
+    with pytest.raises(ltl.errors.RestartError, match="holds a run that has not ended"):
         run()
     assert states == {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}

@@ -7,12 +7,12 @@ import pytest
 from mesh_files import WRITERS, damaged
 
 import ltljax as ltl
-from ltljax.lifting import paper
-from ltljax.lifting.ring import RingTopology
+from ltljax._lifting import paper
+from ltljax._lifting.ring import RingTopology
 
 SCHEMES = [ltl.Paper(), ltl.Monotone(), ltl.Monotone(lift="projection"), ltl.Polynomial(3), ltl.Polynomial(4)]
 # What these meshes are made for.
-pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 
 
 def assert_sound(mesh, dtype=jnp.float64):
@@ -58,7 +58,7 @@ def test_crumpled_spheres_give_finite_operators(seed):
 @pytest.mark.parametrize(
     ("lift", "height", "inconsistent"), [("chord", 0.0, False), ("chord", -0.99, True), ("intrinsic", -0.99, False)]
 )
-@pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+@pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 def test_a_pit_is_counted_and_stays_stable(lift, height, inconsistent):
     sphere = ltl.shapes.icosphere(2)
     vertices = sphere.vertices.copy()

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 import ltljax as ltl
-from ltljax.mesh.columns import DataError
+from ltljax._mesh.columns import DataError
 
 MESH = ltl.shapes.icosphere(2)
 FIELDS = {"height": MESH.vertices[:, 2], "normal": MESH.vertices.astype(np.float32)}
@@ -168,7 +168,7 @@ def test_meshes_of_other_packages_come_with_their_data():
         mesh = ltl.as_mesh(source)
         np.testing.assert_allclose(mesh.vertices, MESH.vertices, atol=1e-7)
         np.testing.assert_array_equal(mesh.faces, MESH.faces)
-        np.testing.assert_array_equal(ltl.vertex_data(source, mesh)["height"], height)
+        np.testing.assert_array_equal(ltl.io.vertex_data(source, mesh)["height"], height)
     tensor = lambda array: SimpleNamespace(numpy=lambda: array)  # noqa: E731
     for source in (
         (MESH.vertices, MESH.faces),
@@ -178,7 +178,7 @@ def test_meshes_of_other_packages_come_with_their_data():
     ):
         mesh = ltl.as_mesh(source)
         np.testing.assert_array_equal(mesh.faces, MESH.faces)
-        assert ltl.vertex_data(source, mesh) == {}
+        assert ltl.io.vertex_data(source, mesh) == {}
     assert ltl.as_mesh(MESH) is MESH
 
 

@@ -12,11 +12,11 @@ import pytest
 import trimesh
 
 import ltljax as ltl
-from ltljax import scenario
-from ltljax.cli import main
-from ltljax.mesh import columns
-from ltljax.output import files
-from ltljax.scenario.written import KINETICS
+from ltljax._mesh import columns
+from ltljax._output import files
+from ltljax.app import scenario
+from ltljax.app.cli import main
+from ltljax.app.scenario.written import KINETICS
 
 PLAIN = """
 [mesh]
@@ -82,7 +82,7 @@ def test_directions_and_flows_become_operators(tmp_path):
     equation = scenario.read(text, "flowing", tmp_path)
     surface = ltl.Surface.from_mesh(equation.mesh)
     spreads = equation.make_equation(surface).diffusivity
-    assert all(isinstance(spread, ltl.EllipticStencil) for spread in spreads)
+    assert all(isinstance(spread, ltl.operators.EllipticStencil) for spread in spreads)
 
 
 def saved_ball(path):
@@ -93,7 +93,7 @@ def saved_ball(path):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr("ltljax.output.pictures.can_draw", lambda: False)
+    monkeypatch.setattr("ltljax._output.pictures.can_draw", lambda: False)
 
 
 def test_a_resolved_scenario_gives_the_same_numbers_again(tmp_path, no_pictures):

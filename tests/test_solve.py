@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax.run import count_maxima
+from ltljax.app.run import count_maxima
 
 # Of real meshes, which have a few.
-pytestmark = pytest.mark.filterwarnings("ignore::ltljax.InconsistentRowsWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_a_source_may_depend_on_time_and_place(sphere):
 def test_the_default_is_second_order_in_time_where_explicit_steps_would_be_unstable(sphere, evaluations_at_most):
     equation = ltl.Diffusion()
     # Of a surface that diffrax traces the width is not measured, and a bound of it asks for more damping.
-    solver = ltl.RKL2(spectral_width=lambda *_: ltl.spectral_width(sphere))
+    solver = ltl.RKL2(spectral_width=lambda *_: ltl.operators.spectral_width(sphere))
     u0 = sphere.vertices.prod(axis=1) + sphere.vertices[:, 0]
     rate = np.array(ltl.laplacian_matrix(sphere).todense())
     values, vectors = np.linalg.eig(rate)

@@ -26,8 +26,8 @@ def spreads(kind):
     if kind == "field":
         return g
     if kind == "stencil":
-        return ltl.elliptic_stencil(SURFACE, g, divergence_form=True)
-    return ltl.elliptic_stencil(SURFACE, g[:, None, None] * jnp.eye(3)[None], divergence_form=True)
+        return ltl.operators.elliptic_stencil(SURFACE, g, divergence_form=True)
+    return ltl.operators.elliptic_stencil(SURFACE, g[:, None, None] * jnp.eye(3)[None], divergence_form=True)
 
 
 def quadratic(flux_of=None):
@@ -79,7 +79,7 @@ def test_a_field_of_one_value_is_that_number():
     "equation", [ltl.Diffusion, lambda d, **more: ltl.ReactionDiffusion(d, lambda s, _: (0 * s[0],) * 3, **more)]
 )
 def test_every_species_has_its_own_way_to_spread(equation):
-    stencil = ltl.elliptic_stencil(SURFACE, conductivity())
+    stencil = ltl.operators.elliptic_stencil(SURFACE, conductivity())
     both = jnp.stack([jnp.sin(X), jnp.cos(Y), X * Y], axis=1)
     boundary = ltl.Neumann(1.5)
     rate = equation((0.5, conductivity(), stencil), boundary=boundary).rate(NOW, SURFACE, both)
@@ -143,7 +143,7 @@ def test_divergence_form_of_a_tensor_that_turns():
         surface = ltl.Surface.from_mesh(mesh, dtype=jnp.float64)
         points = surface.vertices[:, :2]
         tensor = jnp.zeros((len(points), 3, 3)).at[:, :2, :2].set(jax.vmap(flux)(points))
-        stencil = ltl.elliptic_stencil(surface, tensor, divergence_form=True)
+        stencil = ltl.operators.elliptic_stencil(surface, tensor, divergence_form=True)
         inside = ~np.asarray(mesh.boundary_vertices)
         errors.append(float(jnp.max(jnp.abs(stencil(jax.vmap(u)(points)) - jax.vmap(exact)(points))[inside])))
         again = stencil.with_coefficients(surface, tensor, divergence_form=True)

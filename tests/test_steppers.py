@@ -12,7 +12,7 @@ import optimistix as optx
 import pytest
 
 import ltljax as ltl
-from ltljax.mesh.arguments import as_numbers
+from ltljax._base.arguments import as_numbers
 
 # Solver, order, and the fewest and most fixed steps of the interval.
 SOLVERS = {
@@ -205,7 +205,7 @@ GRADIENTS = {
 def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name):
     solver, how = GRADIENTS[name]
     x = sphere.vertices
-    hierarchy = ltl.multigrid(sphere)
+    hierarchy = ltl.solvers.multigrid(sphere)
     u0 = jnp.stack([1 - 0.5 * jnp.exp(-4 * x[:, 0] ** 2), 0.5 * jnp.exp(-4 * x[:, 1] ** 2)], axis=1)
 
     def loss(parameters):
@@ -239,7 +239,7 @@ def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name
     solver, how = GRADIENTS[name]
     surface = ltl.Surface.from_mesh(ltl.shapes.disk(rings=6))
     x = surface.vertices
-    hierarchy = ltl.multigrid(surface)
+    hierarchy = ltl.solvers.multigrid(surface)
 
     @jax.jit
     def loss(parameters):
@@ -310,7 +310,7 @@ def test_ensembles_are_vmapped_through_implicit_steps(sphere):
 
 def test_jacobi_serves_where_multigrid_does_not(sphere, monkeypatch):
     with_multigrid = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
-    monkeypatch.setattr(sys.modules["ltljax.solve.evolve"], "is_available", lambda: False)
+    monkeypatch.setattr(sys.modules["ltljax._solve.evolve"], "is_available", lambda: False)
     without = ltl.solve(ltl.Diffusion(), sphere, sphere.vertices[:, 0], 0.5, solver=ltl.TRBDF2())
     assert "multigrid" in with_multigrid.stats["solver"]
     assert "Jacobi" in without.stats["solver"]
@@ -420,7 +420,7 @@ def test_each_mistake_is_one_clear_error(sphere, case):
 
 
 def test_the_longest_stable_step_is_that_of_the_stiffest_mode(sphere):
-    from ltljax.solve.checks import longest_step
+    from ltljax._solve.checks import longest_step
 
     values = np.linalg.eigvals(ltl.laplacian_matrix(sphere).todense())
     longest = longest_step(diffrax.Heun(), np.abs(values).max(), 0.0)

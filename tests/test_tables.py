@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import paper_reference
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import ltljax as ltl
-from ltljax.tables import build_table, difference_sum
+from ltljax._tables import build_table, difference_sum
 
 
 def poles(valence):

@@ -8,9 +8,9 @@ import trimesh
 from PIL import Image
 
 import ltljax as ltl
-from ltljax import scenario
-from ltljax.cli import main
-from ltljax.output import colors, files, texture
+from ltljax._output import colors, files, texture
+from ltljax.app import scenario
+from ltljax.app.cli import main
 
 
 def in_light(colours):
@@ -140,10 +140,10 @@ def test_letters_beyond_ascii_do_not_reach_the_names_inside_an_obj(tmp_path):
 def test_a_surface_takes_a_field_as_its_relief():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
     z = np.asarray(surface.vertices[:, 2])
-    raised = ltl.displaced(surface, z, 0.5)
+    raised = ltl.imaging.displaced(surface, z, 0.5)
     np.testing.assert_allclose(np.linalg.norm(raised.vertices, axis=1).max(), 1.5, atol=1e-3)
     with pytest.raises(ValueError, match="finite values"):
-        ltl.displaced(surface, np.full_like(z, np.nan))
+        ltl.imaging.displaced(surface, np.full_like(z, np.nan))
 
 
 def test_displacement_follows_the_normals():

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import ltljax as ltl
 
-warnings.filterwarnings("ignore", category=ltl.IncompatibleSourceWarning)
+warnings.filterwarnings("ignore", category=ltl.errors.IncompatibleSourceWarning)
 
 # Powers of ten that fields are multiplied with, and lengths, whose squares have to stay in range too.
 FIELDS = {"float32": 25, "float64": 150}
@@ -27,7 +26,9 @@ LINEAR = {
     "laplacian": lambda s, u: ltl.laplacian(s, u),
     "hessian": lambda s, u: ltl.hessian(s, u),
     "integral": lambda s, u: ltl.integrate(s, u),
-    "vector_laplacian": lambda s, u: ltl.vector_laplacian(s, ltl.tangential(s, u[:, None] * jnp.asarray(X, u.dtype))),
+    "vector_laplacian": lambda s, u: ltl.vector_laplacian(
+        s, ltl.vectors.tangential(s, u[:, None] * jnp.asarray(X, u.dtype))
+    ),
     "poisson": lambda s, u: ltl.poisson(s, u - ltl.integrate(s, u) / jnp.sum(s.vertex_areas)),
     "screened_poisson": lambda s, u: ltl.screened_poisson(s, u),
     "steady_state": lambda s, u: ltl.steady_state(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax.output.viewer import Inline, viewer_html, write_viewer
+from ltljax._output.viewer import Inline, viewer_html, write_viewer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

@@ -1,0 +1,283 @@
+"""What holds on the boundary of a surface: conditions as values, and what they do to a diffusion.
+
+What enters: conditions, the time and the state. What leaves: the fluxes they let through, and the values they hold.
+Where nothing is said the normal derivative vanishes. Of two conditions for the same vertex the later one holds.
+"""
+
+import functools
+import inspect
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._operators.scalar import add_flux, laplacian, through_sides
+from .._surface.surface import Surface
+
+# None for the whole boundary, the number of a boundary loop (as in mesh.boundary_loops), a mask (V,), or a predicate
+# ``vertices (V, 3) -> (V,)``.
+Where = None | int | Bool[Array, " V"] | Callable[[Float[Array, "V 3"]], Bool[Array, " V"]]
+# None for all species of a state (V, S), the number of one, or several of them.
+Species = None | int | tuple[int, ...]
+# A number, an array that fits the state, or a function ``(t, vertices) -> array``.
+Data = Any
+
+
+def _species(given: Species) -> Species:
+    if given is None:
+        return None
+    return (
+        tuple(operator.index(species) for species in given)
+        if isinstance(given, tuple | list)
+        else operator.index(given)
+    )
+
+
+class Neumann(eqx.Module):
+    """du/dnu = flux on the boundary, nu the outward conormal.
+
+    Attributes:
+        flux: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these; also the gradient whose
+            part along the conormal is meant, (V, 3) or (V, S, 3), which serves both sides of a corner.
+        where: None for the whole boundary, the number of a loop in ``mesh.boundary_loops``, a mask (V,), or a predicate
+            ``vertices (V, 3) -> (V,)``.
+        species: of a state (V, S) the number of the species that is meant, or several; None for all.
+    """
+
+    flux: Data = 0.0
+    where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
+
+
+class Dirichlet(eqx.Module):
+    """u = value on the boundary; with a mask also at vertices inside.
+
+    Attributes:
+        value: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these.
+        where: as of `Neumann`.
+        species: as of `Neumann`.
+    """
+
+    value: Data = 0.0
+    where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
+
+
+class Robin(eqx.Module):
+    """a u + b du/dnu = g on the boundary, nu the outward conormal. Diffusion stays stable where a / b >= 0.
+
+    Attributes:
+        a: as the values of `Dirichlet`.
+        b: as the values of `Dirichlet`; not zero.
+        g: as the values of `Dirichlet`.
+        where: as of `Neumann`.
+        species: as of `Neumann`.
+    """
+
+    a: Data = 1.0
+    b: Data = 1.0
+    g: Data = 0.0
+    where: Where = None
+    species: Species = eqx.field(default=None, static=True, converter=_species)
+
+
+Condition = Neumann | Dirichlet | Robin
+Conditions = Condition | tuple[Condition, ...]
+
+
+def as_tuple(conditions: Conditions | list[Condition] | None) -> tuple[Condition, ...]:
+    """The conditions as a tuple."""
+    if conditions is None:
+        return ()
+    conditions = tuple(conditions) if isinstance(conditions, tuple | list) else (conditions,)
+    for condition in conditions:
+        if not isinstance(condition, Condition):
+            raise TypeError(f"Expected ltl.Neumann, ltl.Dirichlet or ltl.Robin, found {condition!r}.")
+    return conditions
+
+
+def bounded_laplacian(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "V *S"]:
+    """The Laplacian of a state that keeps the conditions, with the fluxes they let through."""
+    rate, flux = laplacian(surface, u), fluxes(surface, conditions, t, u)
+    return rate if flux is None else add_flux(surface, rate, flux)
+
+
+def fluxes(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "2 B *S"] | None:
+    """The normal derivatives of a state at both sides of the boundary vertices; None where none are prescribed."""
+    conditions = as_tuple(conditions)
+    if not any(isinstance(condition, Neumann | Robin) for condition in conditions):
+        return None
+    boundary = surface.topology.boundary
+    through = jnp.zeros((2, boundary.shape[0], *u.shape[1:]), u.dtype)
+    for condition in conditions:
+        if isinstance(condition, Neumann):
+            flux = through_sides(surface, _data(condition.flux, t, surface, u, may_be_gradient=True), u)
+        elif isinstance(condition, Robin):
+            a, b, g = (_data(data, t, surface, u) for data in (condition.a, condition.b, condition.g))
+            flux = through_sides(surface, (g - a * u) / b, u)
+        else:
+            continue
+        through = jnp.where(_covered(condition, surface, u)[boundary][None], flux, through)
+    return through
+
+
+def held(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, "V *S"]:
+    """The state with the values that Dirichlet conditions hold."""
+    for condition in _dirichlet(conditions):
+        u = _where(condition, surface, _data(condition.value, t, surface, u), u)
+    return u
+
+
+def held_rate(
+    surface: Surface,
+    conditions: Conditions,
+    t: Float[Array, ""],
+    u: Float[Array, "V *S"],
+    rate: Float[Array, "V *S"],
+) -> Float[Array, "V *S"]:
+    """The rate of change, where Dirichlet conditions hold the state that of their values."""
+    for condition in _dirichlet(conditions):
+        at = jnp.asarray(t, u.dtype)
+        _, change = jax.jvp(lambda s, c=condition: _data(c.value, s, surface, u), (at,), (jnp.ones_like(at),))
+        rate = _where(condition, surface, change, rate)
+    return rate
+
+
+def released(surface: Surface, conditions: Conditions, rate: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
+    """The rate of change, zero where Dirichlet conditions hold the state."""
+    for condition in _dirichlet(conditions):
+        rate = _where(condition, surface, jnp.zeros_like(rate), rate)
+    return rate
+
+
+def held_values(surface: Surface, conditions: Conditions, u: Float[Array, "V *S"]) -> Bool[Array, "V *S"]:
+    """Which values of a state Dirichlet conditions hold."""
+    masks = [_covered(condition, surface, u) for condition in _dirichlet(conditions)]
+    return functools.reduce(jnp.logical_or, masks, jnp.zeros(u.shape, bool))
+
+
+def held_vertices(surface: Surface, conditions: Conditions) -> Bool[Array, " V"]:
+    """The vertices at which Dirichlet conditions hold every species."""
+    masks = [_mask(condition.where, surface) for condition in _dirichlet(conditions) if condition.species is None]
+    return functools.reduce(jnp.logical_or, masks, jnp.zeros(surface.num_vertices, bool))
+
+
+def absorption(
+    surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
+) -> Float[Array, " V"]:
+    """What Robin conditions take from -Delta u at each vertex, per unit of u; the mean over species."""
+    linear = tuple(
+        Robin(condition.a, condition.b, 0.0, condition.where, condition.species)
+        if isinstance(condition, Robin)
+        else Neumann(0.0, condition.where, condition.species)
+        for condition in as_tuple(conditions)
+        if not isinstance(condition, Dirichlet)
+    )
+    taken = -bounded_laplacian(surface, linear, t, jnp.ones_like(u))
+    return jnp.mean(taken.reshape(surface.num_vertices, -1), axis=1)
+
+
+def stiffness(
+    surface: Surface,
+    conditions: Conditions,
+    t: Float[Array, ""],
+    u: Float[Array, "V *S"],
+    weights: Float[Array, "B 2"] | None = None,
+) -> Float[Array, ""]:
+    """A bound of what Robin conditions add to the eigenvalues of the Laplacian, or of an operator with flux weights of
+    its own."""
+    bound = jnp.zeros((), u.dtype)
+    for condition in as_tuple(conditions):
+        if isinstance(condition, Robin):
+            ratio = _data(condition.a, t, surface, u) / _data(condition.b, t, surface, u)
+            ratio = jnp.where(_covered(condition, surface, u), ratio, 0)
+            added = add_flux(surface, jnp.zeros_like(u), through_sides(surface, jnp.abs(ratio), u), weights)
+            bound = jnp.maximum(bound, jnp.max(jnp.abs(added)))
+    return bound
+
+
+def _dirichlet(conditions: Conditions) -> list[Dirichlet]:
+    return [condition for condition in as_tuple(conditions) if isinstance(condition, Dirichlet)]
+
+
+def _where(condition: Condition, surface: Surface, inside: Array, outside: Array) -> Array:
+    return jnp.where(_covered(condition, surface, outside), inside, outside)
+
+
+def _covered(condition: Condition, surface: Surface, u: Array) -> Bool[Array, "V *#S"]:
+    """Which values of a state a condition is for."""
+    mask = _mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1))
+    if condition.species is None:
+        return mask
+    if u.ndim != 2:
+        raise ValueError(
+            f"A condition for species {condition.species} needs a state of several species, (V, S), found {u.shape}."
+        )
+    chosen = (condition.species,) if isinstance(condition.species, int) else condition.species
+    if not all(0 <= species < u.shape[1] for species in chosen):
+        raise ValueError(f"Expected species from 0 to {u.shape[1] - 1}, found {condition.species} in a condition.")
+    return mask & jnp.asarray([species in chosen for species in range(u.shape[1])])[None]
+
+
+def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:
+    """The vertices a condition is for."""
+    topology = surface.topology
+    is_mask = not (where is None or isinstance(where, int) or callable(where))
+    if topology.num_loops == 0 and not is_mask:
+        raise ValueError(
+            "A boundary condition was given, but the surface is closed. Give a mask to hold values inside."
+        )
+    if isinstance(where, int) and not 0 <= where < topology.num_loops:
+        raise ValueError(
+            f"Expected the number of a boundary loop below {topology.num_loops} (see mesh.boundary_loops), "
+            f"found {where}."
+        )
+    size = surface.num_vertices
+    everywhere = jnp.zeros(size, bool).at[topology.boundary].set(True)
+    if where is None:
+        return everywhere
+    if isinstance(where, int):
+        return jnp.zeros(size, bool).at[topology.boundary].set(topology.loops == where)
+    mask = where(surface.vertices) if callable(where) else jnp.asarray(where)
+    if mask.shape != (size,) or mask.dtype != bool:
+        raise ValueError(f"Expected `where` to give booleans of shape ({size},), found {mask.dtype} {mask.shape}.")
+    return mask & everywhere if callable(where) else mask
+
+
+def _called(data: Callable, t: Any, surface: Surface) -> Any:
+    """What a function of time and place returns."""
+    try:
+        inspect.signature(data).bind(t, surface.vertices)
+    except TypeError:
+        raise TypeError(
+            "Expected data of a boundary condition as a number, an array or a function (t, vertices) -> array, found a "
+            f"function {inspect.signature(data)}."
+        ) from None
+    return data(t, surface.vertices)
+
+
+def _data(data: Data, t, surface: Surface, u: Array, *, may_be_gradient: bool = False) -> Array:
+    """The data of a condition at a time, in the shape of the state (or of its gradient)."""
+    values = jnp.asarray(_called(data, t, surface) if callable(data) else data, u.dtype)
+    if may_be_gradient and values.shape == (*u.shape, 3):
+        return values
+    if values.shape == u.shape[:1] and u.ndim == 2:
+        return jnp.broadcast_to(values[:, None], u.shape)
+    if values.shape in ((), u.shape[1:]):
+        return jnp.broadcast_to(values.reshape((1,) * (u.ndim - values.ndim) + values.shape), u.shape)
+    if values.shape != u.shape:
+        raise ValueError(
+            f"Expected boundary data as a number or of shape {u.shape}{f' or {u.shape[:1]}' * (u.ndim - 1)}"
+            f"{f' or {(*u.shape, 3)}' * may_be_gradient}, found {values.shape}."
+        )
+    return values

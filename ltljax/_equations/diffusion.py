@@ -1,0 +1,82 @@
+"""Linear diffusion with a source, of one field or of several species that do not meet."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._surface.surface import Surface
+from . import boundary as bounds
+from .boundary import Conditions
+from .equation import Equation
+from .spreads import Spreads, as_spreads, mean_diffusivities, spread_bound, spread_rate, spread_width
+
+Source = Float[Array, "V *S"] | Callable[[Float[Array, ""], Float[Array, "V 3"]], Float[Array, "V *S"]]
+
+
+class Diffusion(Equation):
+    """u_t = D Delta u + g, or div(D grad u) + g where D varies, on a surface.
+
+    Attributes:
+        diffusivity: D, a positive number; a field (V,) for div(D grad u), which may jump, and through a zero of which
+            nothing flows (`weighted_laplacian` with the harmonic mean); or an `EllipticStencil`, such as diffusion
+            along a direction field or drift with a flow. For a state (V, S) also one number for each species, (S,), or
+            a tuple with any of these for each.
+        source: g: None, an array like the state, or a function ``(t, vertices) -> array``.
+        boundary: `Neumann`, `Dirichlet` or `Robin`, or several, for all species or some; without any the normal
+            derivative vanishes.
+
+    Source: Chen, Chi and Wu, arXiv 0907.1817, section 3.
+    """
+
+    diffusivity: Spreads = eqx.field(default=1.0, converter=as_spreads)
+    source: Source | None = None
+    boundary: Conditions = eqx.field(default=(), converter=bounds.as_tuple)
+
+    def rate(self, t, surface: Surface, u):
+        """The time derivative D Delta u + g; of a value that is held, that value's."""
+        return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
+
+    def implicit_rate(self, t, surface: Surface, u):
+        """D Delta u with the fluxes through the boundary; of a value that is held, that value's rate."""
+        u = self.held(t, surface, u)
+        spread = spread_rate(surface, self.diffusivity, self.boundary, t, u)
+        return bounds.held_rate(surface, self.boundary, t, u, spread)
+
+    def explicit_rate(self, t, surface: Surface, u):
+        """The source g; zero where a value is held."""
+        if self.source is None:
+            return jnp.zeros_like(u)
+        source = self.source(t, surface.vertices) if callable(self.source) else self.source
+        source = jnp.asarray(source, u.dtype)
+        if source.shape != u.shape:
+            raise ValueError(f"Expected a source of the shape of the state, {u.shape}, found {source.shape}.")
+        return bounds.released(surface, self.boundary, source)
+
+    def diffusivities(self, u):
+        """D for every species; of what varies, the mean."""
+        return mean_diffusivities(self.diffusivity, u)
+
+    @property
+    def is_affine(self) -> bool:
+        """It is."""
+        return True
+
+    @property
+    def conditions(self):
+        """The boundary conditions."""
+        return bounds.as_tuple(self.boundary)
+
+    def held(self, t, surface: Surface, u):
+        """The state with the values that the boundary conditions hold."""
+        return bounds.held(surface, self.boundary, t, u)
+
+    def spectral_bound(self, t, surface: Surface, u):
+        """The largest diffusivity times the bound of the Laplacian's eigenvalues, or the largest of the operators'."""
+        return spread_bound(surface, self.diffusivity, self.boundary, t, u)
+
+    def spectral_width(self, t, surface: Surface, u):
+        """The largest diffusivity times the Laplacian's width, or the largest of the operators'."""
+        del t
+        return spread_width(surface, self.diffusivity, u)

@@ -1,0 +1,1 @@
+"""Pictures of vector fields: streamlines and line integral convolution."""

@@ -1,0 +1,1 @@
+"""Images on surfaces: a colour or grey value at each vertex."""

@@ -1,0 +1,1 @@
+"""The shape of the surface itself: fairing, denoising of scans, relief."""

@@ -1,0 +1,156 @@
+"""Which flips make a triangulation intrinsically Delaunay: chosen once, on the host, from the positions.
+
+What enters: the faces, the table of one-rings and the positions. What leaves: the flips that lead to the intrinsic
+Delaunay triangulation, and the connectivity of its half-edges (`HalfEdges`).
+
+Source: Bobenko and Springborn (2007), A discrete Laplace-Beltrami operator for simplicial surfaces,
+doi:10.1007/s00454-007-9006-1.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from .._tables import Table
+from .intrinsic import Flips, RingAngles, Triangulation, corner_angle, flip, flipped, ring_angles
+from .ring import RingTopology
+
+# Two angles opposite an edge may exceed pi by this much: the diagonals of a square tie, and rounding decides nothing.
+_TIE = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class HalfEdges:
+    """The half-edges of a triangulation (host).
+
+    Attributes:
+        following: (H,) the next half-edge of the same face; -1 where there is no face.
+        tails: (H,) the vertex at which each begins.
+        lengths: (E,) the lengths of the edges.
+        angles: (H,) the angle of each from the first half-edge of its tail, in radians, before charts are scaled.
+    """
+
+    following: np.ndarray
+    tails: np.ndarray
+    lengths: np.ndarray
+    angles: np.ndarray
+
+
+def delaunay_triangulation(
+    faces: np.ndarray,
+    vertices: np.ndarray,
+    ring: Table,
+    ring_blocks: tuple[RingTopology, ...],
+    is_folded: np.ndarray,
+) -> tuple[Triangulation, HalfEdges, RingAngles]:
+    """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
+
+    Every round flips a set of edges that do not share a face, those first whose opposite angles exceed pi the most, and
+    looks again at the edges around them. Edges between two vertices marked in ``is_folded`` (V,), which are the corners
+    of faces that are folded over and their neighbours, stay, so that no edge leads through such a face. All edges at
+    other vertices are Delaunay, which keeps the cotangent weights there non-negative.
+    """
+    ends, following = _connectivity(faces, len(vertices))
+    tails = ends.ravel().copy()
+    flipless = Triangulation(ends, _ring_slots(ring, tails, len(vertices)), _in_levels([], len(tails)), tails)
+    mesh_angles = ring_angles(vertices, flipless, ring, ring_blocks)
+    lengths, angles = flipped(mesh_angles, flipless)
+    face_of = np.full(len(tails), -1)
+    corner = np.flatnonzero(following >= 0)
+    face_of[corner] = np.minimum(corner, np.minimum(following[corner], following[following[corner]]))
+    levels, candidates = [], np.arange(len(ends))
+    while len(candidates):
+        is_kept = is_folded[tails[2 * candidates]] & is_folded[tails[2 * candidates + 1]]
+        candidates = candidates[~is_kept]
+        excess = _excess(candidates, following, face_of, lengths)
+        wanting, excess = candidates[excess > _TIE], excess[excess > _TIE]
+        h = 2 * wanting[_independent(wanting, excess, face_of)]
+        if not len(h):
+            break
+        h1, t1 = following[h], following[h ^ 1]
+        h2, t2 = following[h1], following[t1]
+        levels.append(np.stack([h, h1, h2, t1, t2]))
+        lengths, angles = flip(lengths, angles, h, levels[-1][1:])
+        tails[h], tails[h ^ 1] = tails[t2], tails[h2]
+        following[h], following[h2], following[t1] = h2, t1, h
+        following[h ^ 1], following[t2], following[h1] = t2, h1, h ^ 1
+        face_of[t1], face_of[h1] = face_of[h], face_of[h ^ 1]
+        candidates = np.union1d(wanting, np.concatenate([h1, h2, t1, t2]) >> 1)
+    triangulation = Triangulation(ends, flipless.slots, _in_levels(levels, len(tails)), tails.astype(np.int32))
+    return triangulation, HalfEdges(following, tails, lengths, angles), mesh_angles
+
+
+def _in_levels(levels: list[np.ndarray], fill: int) -> Flips:
+    """The flips of all levels, each (5, N), made equally wide."""
+    width = max((level.shape[1] for level in levels), default=0)
+    padded = np.full((len(levels), 5, width), fill, np.int32)
+    for row, level in zip(padded, levels, strict=True):
+        row[:, : level.shape[1]] = level
+    return Flips(padded[:, 0], padded[:, 1:])
+
+
+def _connectivity(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """The ends (E, 2) of the edges, the lower vertex first, and the next half-edge of each half-edge's face."""
+    tail = faces.astype(np.int64)
+    head = np.roll(tail, -1, axis=1)
+    keys = np.minimum(tail, head) * num_vertices + np.maximum(tail, head)
+    order = np.argsort(keys, axis=None)
+    is_first = np.diff(keys.ravel()[order], prepend=-1) > 0
+    edge = np.empty(keys.size, np.int64)
+    edge[order] = np.cumsum(is_first) - 1
+    half_edge = 2 * edge.reshape(keys.shape) + (tail > head)
+    unique = keys.ravel()[order][is_first]
+    following = np.full(2 * len(unique), -1)
+    following[half_edge] = np.roll(half_edge, -1, axis=1)
+    return np.stack([unique // num_vertices, unique % num_vertices], axis=1).astype(np.int32), following
+
+
+def _ring_slots(ring: Table, tails: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Where each half-edge of the mesh stands in the table of one-rings, blocks laid end to end."""
+    keys, positions, start = [], [], 0
+    for block in ring.blocks:
+        row = np.broadcast_to(block.centre(np.arange(num_vertices)), block.indices.shape)
+        used = np.flatnonzero(block.is_used)
+        keys.append((row * num_vertices + block.indices).ravel()[used])
+        positions.append(start + used)
+        start += block.indices.size
+    keys, positions = np.concatenate(keys), np.concatenate(positions)
+    order = np.argsort(keys)
+    heads = tails.reshape(-1, 2)[:, ::-1].ravel()
+    found = np.searchsorted(keys[order], tails.astype(np.int64) * num_vertices + heads)
+    return positions[order[found]].astype(np.int32)
+
+
+def _excess(edges: np.ndarray, following: np.ndarray, face_of: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """By how much the angles opposite each edge exceed pi; -pi where it has not two different faces."""
+    h = 2 * edges
+    has_two = (following[h] >= 0) & (following[h ^ 1] >= 0) & (face_of[h] != face_of[h ^ 1])
+    excess = np.full(len(edges), -np.pi)
+    own = lengths[edges[has_two]]
+    total = -np.pi
+    for side in (h[has_two], h[has_two] ^ 1):
+        ahead = following[side]
+        total = total + corner_angle(own, lengths[ahead >> 1], lengths[following[ahead] >> 1])
+    excess[has_two] = total
+    return excess
+
+
+def _independent(edges: np.ndarray, excess: np.ndarray, face_of: np.ndarray) -> np.ndarray:
+    """Which of the edges to flip together: those that come first, by their excess, in both of their faces."""
+    rank = np.empty(len(edges), np.int64)
+    rank[np.argsort(-excess, kind="stable")] = np.arange(len(edges))
+    sides = face_of[2 * edges], face_of[2 * edges + 1]
+    first = np.full(len(face_of), len(edges))
+    for side in sides:
+        np.minimum.at(first, side, rank)
+    return (first[sides[0]] == rank) & (first[sides[1]] == rank)
+
+
+def opposite_edges(half_edges: HalfEdges, which: np.ndarray, none: int) -> np.ndarray:
+    """For half-edges (N,) their edge, and the other two of the faces on the left and right, (5, N); `none` without."""
+    out = [which >> 1]
+    for side in (which, which ^ 1):
+        ahead = half_edges.following[side]
+        has_face = ahead >= 0
+        out += [np.where(has_face, ahead >> 1, none), np.where(has_face, half_edges.following[ahead] >> 1, none)]
+    return np.stack(out)

@@ -1,0 +1,1 @@
+"""Differential operators: ``(surface, field) -> field``."""

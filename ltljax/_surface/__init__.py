@@ -1,0 +1,1 @@
+"""The surface: the pytree, and how a mesh becomes one."""

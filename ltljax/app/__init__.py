@@ -1,0 +1,1 @@
+"""The application: scenarios, commands on mesh files, and the command line."""

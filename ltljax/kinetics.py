@@ -1,0 +1,39 @@
+"""Reaction kinetics: how species change one another at a point, ``((u, v), params) -> (du, dv)``.
+
+Patterns: `turk`, `gray_scott`, `schnakenberg`, `brusselator`, `barrio`, `gierer_meinhardt`, `meinhardt`. Fronts, waves
+and spirals: `barkley`, `fitzhugh_nagumo`, `allen_cahn`, `ginzburg_landau`, `fisher_kpp`, `lotka_volterra`.
+"""
+
+from ._equations.kinetics import (
+    Kinetics,
+    allen_cahn,
+    barkley,
+    barrio,
+    brusselator,
+    fisher_kpp,
+    fitzhugh_nagumo,
+    gierer_meinhardt,
+    ginzburg_landau,
+    gray_scott,
+    lotka_volterra,
+    meinhardt,
+    schnakenberg,
+    turk,
+)
+
+__all__ = [
+    "Kinetics",
+    "allen_cahn",
+    "barkley",
+    "barrio",
+    "brusselator",
+    "fisher_kpp",
+    "fitzhugh_nagumo",
+    "gierer_meinhardt",
+    "ginzburg_landau",
+    "gray_scott",
+    "lotka_volterra",
+    "meinhardt",
+    "schnakenberg",
+    "turk",
+]
