@@ -27,17 +27,17 @@ from ._equations import (
 from ._fit import Observations as Observations, fit as fit
 from ._lifting.schemes import Monotone as Monotone, Paper as Paper, Polynomial as Polynomial
 from ._mesh import Mesh as Mesh, MeshError as MeshError, as_mesh as as_mesh, load_mesh as load_mesh
-from ._operators.curvature import curvature as curvature
-from ._operators.scalar import (
+from ._operators import (
+    curvature as curvature,
     divergence as divergence,
     gradient as gradient,
     hessian as hessian,
     integrate as integrate,
     laplacian as laplacian,
     laplacian_matrix as laplacian_matrix,
+    vector_laplacian as vector_laplacian,
     weighted_laplacian as weighted_laplacian,
 )
-from ._operators.tangent import vector_laplacian as vector_laplacian
 from ._output.load import load_fields as load_fields
 from ._output.save import save as save
 from ._show import plot as plot, view as view

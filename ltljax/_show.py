@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ._mesh import Mesh
 from ._solve import Dispersion, Solution
-from ._surface.surface import Surface, on_surface
+from ._surface import Surface, on_surface
 from ._tables import AnyArray
 
 

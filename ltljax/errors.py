@@ -6,8 +6,7 @@ from ._mesh import MeshError
 from ._solve.evolve import GrowingModesWarning, SolveError
 from ._solve.restart import RestartError
 from ._solve.stationary import IncompatibleSourceWarning
-from ._surface.building import CoarseMeshWarning, InconsistentRowsWarning
-from ._surface.surface import FarFromOriginWarning
+from ._surface import CoarseMeshWarning, FarFromOriginWarning, InconsistentRowsWarning
 
 __all__ = [
     "CoarseMeshWarning",
@@ -21,3 +20,7 @@ __all__ = [
     "RestartError",
     "SolveError",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

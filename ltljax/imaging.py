@@ -68,3 +68,7 @@ __all__ = [
     "structure_tensor",
     "to_texture",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

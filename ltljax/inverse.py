@@ -51,3 +51,7 @@ __all__ = [
     "smoothness",
     "total_variation",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

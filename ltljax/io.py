@@ -13,3 +13,7 @@ __all__ = [
     "save",
     "vertex_data",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

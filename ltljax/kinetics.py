@@ -37,3 +37,7 @@ __all__ = [
     "schnakenberg",
     "turk",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -53,3 +53,7 @@ __all__ = [
     "solve",
     "steady_state",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

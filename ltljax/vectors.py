@@ -1,6 +1,6 @@
 """Tangent vector fields, (V, 3) in ambient coordinates: their derivatives, transport, and decompositions."""
 
-from ._operators.tangent import (
+from ._operators import (
     Connection,
     connection,
     covariant_derivative,
@@ -46,3 +46,7 @@ __all__ = [
     "transport_vectors",
     "vector_laplacian",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

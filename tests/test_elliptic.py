@@ -9,8 +9,8 @@ import scipy.sparse.linalg
 import ltljax as ltl
 
 
-def relative(found, exact):
-    return float(np.linalg.norm(np.asarray(found) - exact) / np.linalg.norm(exact))
+def relative_error(result, exact):
+    return float(np.linalg.norm(np.asarray(result) - exact) / np.linalg.norm(exact))
 
 
 def least_weight(stencil):
@@ -18,7 +18,7 @@ def least_weight(stencil):
 
 
 def plane(n, D, b):
-    """A jittered square, the stencil of a constant operator, and the operator's exact and found values inside."""
+    """The stencil of a constant operator on a jittered square, and its computed and exact values in the interior."""
     mesh = ltl.shapes.jittered(ltl.shapes.square(n=n), 0.25, seed=0)
     size = mesh.num_vertices
     tensor, drift = np.zeros((3, 3)), np.array([*b, 0.0])
@@ -30,8 +30,8 @@ def plane(n, D, b):
     k = np.array([2.0, 1.0, 0.0])
     phase = mesh.vertices @ k
     exact = -(k @ tensor @ k) * np.sin(phase) + (drift @ k) * np.cos(phase)
-    inside = ~mesh.boundary_vertices
-    return stencil, inside, np.asarray(stencil(jnp.sin(jnp.asarray(phase))))[inside], exact[inside]
+    interior = ~mesh.boundary_vertices
+    return stencil, interior, np.asarray(stencil(jnp.sin(jnp.asarray(phase))))[interior], exact[interior]
 
 
 @pytest.mark.parametrize(
@@ -41,10 +41,10 @@ def plane(n, D, b):
 def test_anisotropic_diffusion_with_drift_is_consistent_and_non_negative(D, b, last):
     errors = []
     for n in (16, 32, 64):
-        stencil, inside, found, exact = plane(n, D, b)
+        stencil, interior, values, exact = plane(n, D, b)
         assert least_weight(stencil) >= 0
-        assert float(np.asarray(stencil.residual)[inside].max()) < 1e-7
-        errors.append(relative(found, exact))
+        assert float(np.asarray(stencil.residual)[interior].max()) < 1e-7
+        errors.append(relative_error(values, exact))
     assert np.log2(errors[0] / errors[2]) / 2 > 0.9
     assert errors[-1] < last
 
@@ -52,24 +52,24 @@ def test_anisotropic_diffusion_with_drift_is_consistent_and_non_negative(D, b, l
 def test_drift_alone_is_upwind_and_first_order():
     errors = []
     for n in (16, 32, 64):
-        stencil, _, found, exact = plane(n, np.zeros((2, 2)), [1.0, 0.5])
+        stencil, _, values, exact = plane(n, np.zeros((2, 2)), [1.0, 0.5])
         assert least_weight(stencil) >= 0
-        errors.append(relative(found, exact))
+        errors.append(relative_error(values, exact))
     assert np.log2(errors[0] / errors[2]) / 2 > 0.9
     assert errors[-1] < 3e-2
 
 
-def test_of_the_unit_tensor_it_is_the_laplacian():
+def test_the_stencil_of_the_unit_tensor_is_the_laplacian():
     mesh = ltl.shapes.jittered_sphere(3, 0.5, seed=0)
     surface = ltl.Surface.from_mesh(mesh)
     u = jnp.asarray(mesh.vertices[:, 0] * mesh.vertices[:, 1])
     identity = np.broadcast_to(np.eye(3), (mesh.num_vertices, 3, 3))
     for diffusion in (1.0, np.ones(mesh.num_vertices), identity):
-        found = ltl.operators.elliptic_stencil(surface, diffusion)(u)
-        np.testing.assert_allclose(found, ltl.laplacian(surface, u), atol=1e-10)
+        result = ltl.operators.elliptic_stencil(surface, diffusion)(u)
+        np.testing.assert_allclose(result, ltl.laplacian(surface, u), atol=1e-10)
 
 
-def test_it_has_a_maximum_principle():
+def test_an_elliptic_stencil_has_a_maximum_principle():
     mesh = ltl.shapes.random_sphere(642, seed=0)
     surface = ltl.Surface.from_mesh(mesh)
     random = np.random.default_rng(0)
@@ -90,9 +90,9 @@ def test_coefficients_can_be_changed_and_differentiated():
     x, y, z = mesh.vertices.T
     drift = np.stack([-y, x, 0 * x], axis=1)
     stencil = ltl.operators.elliptic_stencil(surface, 1.0, drift)
-    again = stencil.with_coefficients(surface, 1.0, drift)
+    same = stencil.with_coefficients(surface, 1.0, drift)
     u = jnp.asarray(x * z)
-    np.testing.assert_allclose(again(u), stencil(u), atol=1e-9)
+    np.testing.assert_allclose(same(u), stencil(u), atol=1e-9)
 
     def energy(d):
         return jnp.sum(stencil.with_coefficients(surface, d, drift)(u) ** 2)
@@ -106,28 +106,28 @@ def test_coefficients_that_do_not_fit_are_refused():
     size = surface.num_vertices
     with pytest.raises(ValueError, match=r"found \(5,\)"):
         ltl.operators.elliptic_stencil(surface, np.ones(5))
-    with pytest.raises(ValueError, match="must not be negative"):
+    with pytest.raises(ValueError, match="not negative in any tangent direction"):
         ltl.operators.elliptic_stencil(surface, -1.0)
     skew = np.zeros((size, 3, 3))
     skew[3, 0, 1] = 1
-    with pytest.raises(ValueError, match="must be symmetric, but at vertex 3"):
+    with pytest.raises(ValueError, match="Expected a symmetric diffusion tensor, found an asymmetric one at vertex 3"):
         ltl.operators.elliptic_stencil(surface, skew)
     with pytest.raises(ValueError, match="chosen on the host"):
         jax.jit(lambda s: ltl.operators.elliptic_stencil(s, 1.0)(s.vertices))(surface)
 
 
-def test_conduction_is_div_g_grad():
+def test_the_weighted_laplacian_is_div_g_grad():
     errors = []
     for n in (16, 32, 64):
         mesh = ltl.shapes.jittered(ltl.shapes.square(n=n), 0.2, seed=0)
         x, y, _ = mesh.vertices.T
         g, u = 1 + x**2, np.cos(np.pi * x) * np.cos(2 * np.pi * y)
         exact = -5 * np.pi**2 * g * u - 2 * x * np.pi * np.sin(np.pi * x) * np.cos(2 * np.pi * y)
-        errors.append(relative(ltl.weighted_laplacian(ltl.Surface.from_mesh(mesh), g, u), exact))
+        errors.append(relative_error(ltl.weighted_laplacian(ltl.Surface.from_mesh(mesh), g, u), exact))
     assert np.log2(errors[0] / errors[2]) / 2 > 0.9
     assert errors[-1] < 1e-2
     for scheme in (ltl.Monotone(), ltl.Polynomial(3), ltl.Paper()):
         surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3), scheme)
         x, y, _ = np.asarray(surface.vertices).T
         # div(x grad y) = x Delta y + grad x . grad y = -2 x y - x y on the unit sphere.
-        assert relative(ltl.weighted_laplacian(surface, x, y), -3 * x * y) < 0.05
+        assert relative_error(ltl.weighted_laplacian(surface, x, y), -3 * x * y) < 0.05

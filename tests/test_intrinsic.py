@@ -12,7 +12,7 @@ import scipy.sparse.linalg
 
 import ltljax as ltl
 from ltljax._lifting import support
-from ltljax._lifting.schemes import weigh
+from ltljax._lifting.weighing import weigh
 
 
 def strip(n, degrees, amount=0.3, diagonals="random"):

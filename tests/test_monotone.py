@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 from scipy.special import j0
 
 import ltljax as ltl
-from ltljax._operators.scalar import spectral_bound
+from ltljax._operators import spectral_bound
 
 # Of real meshes, which have a few.
 pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")

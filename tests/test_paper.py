@@ -9,7 +9,7 @@ import paper_reference
 import pytest
 
 import ltljax as ltl
-from ltljax._lifting.schemes import weigh_in_frames
+from ltljax._lifting.weighing import weigh_in_frames
 
 
 def jittered_ellipsoid(axes, amount, seed):

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._operators.scalar import add_flux, laplacian, through_sides
-from .._surface.surface import Surface
+from .._operators import add_flux, laplacian, through_sides
+from .._surface import Surface
 
 # None for the whole boundary, the number of a boundary loop (as in mesh.boundary_loops), a mask (V,), or a predicate
 # ``vertices (V, 3) -> (V,)``.

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._operators.scalar import laplacian, spectral_bound
-from .._surface.surface import Surface
+from .._operators import laplacian, spectral_bound
+from .._surface import Surface
 from .equation import Equation
 
 

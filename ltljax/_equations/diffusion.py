@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._surface.surface import Surface
+from .._surface import Surface
 from . import boundary as bounds
 from .boundary import Conditions
 from .equation import Equation

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._operators.scalar import spectral_bound, spectral_width
-from .._surface.surface import Surface
+from .._operators import spectral_bound, spectral_width
+from .._surface import Surface
 from .boundary import Condition
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._surface.surface import Surface
+from .._surface import Surface
 from .equation import Equation
 
 Motion = Callable[[Float[Array, ""], Float[Array, "V 3"]], Float[Array, "V 3"]]

@@ -10,9 +10,8 @@ from typing import Any, cast
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._operators.elliptic import EllipticStencil
-from .._operators.scalar import add_flux, spectral_bound, spectral_width, weighted_laplacian
-from .._surface.surface import Surface
+from .._operators import EllipticStencil, add_flux, spectral_bound, spectral_width, weighted_laplacian
+from .._surface import Surface
 from . import boundary as bounds
 from .boundary import Conditions
 

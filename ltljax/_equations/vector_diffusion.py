@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._operators.scalar import spectral_bound
-from .._operators.tangent import connection, from_frame, tangential, to_frame
-from .._surface.surface import Surface
+from .._operators import connection, from_frame, spectral_bound, tangential, to_frame
+from .._surface import Surface
 from .._tables import AnyArray
 from .equation import Equation
 

@@ -14,7 +14,7 @@ from scipy.special import lambertw
 from .._base.arguments import as_numbers, positive
 from .._equations import Equation
 from .._solve import Multigrid, Solution, solve
-from .._surface.surface import Surface
+from .._surface import Surface
 from .._tables import AnyArray
 from .calibration import Calibration, broadcasts, calibration
 from .losses import Loss, as_loss

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._operators.scalar import gradient, laplacian
-from .._surface.surface import Surface, on_surface
+from .._operators import gradient, laplacian
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 
 

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from .._base.arguments import as_numbers
-from .._surface.surface import Surface, on_surface
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 
 

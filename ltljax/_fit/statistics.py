@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._operators.scalar import integrate, laplacian
-from .._surface.surface import Surface, on_surface
+from .._operators import integrate, laplacian
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 
 

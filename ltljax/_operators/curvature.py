@@ -1,7 +1,7 @@
-"""How does a surface bend? As a smooth surface by fits, or as the polyhedron it is by its angles.
+"""The curvature of a surface: of the smooth surface, from fits, or of the polyhedron, from its angles.
 
 What enters: a surface. What leaves: its curvature at every vertex, in inverse lengths (mean) and inverse areas (Gauss).
-docs/curvature.md says which of the two is right when.
+docs/curvature.md says when to use which.
 """
 
 import equinox as eqx
@@ -12,22 +12,20 @@ from jaxtyping import Array, Float
 
 from .._lifting.jets import INTERIOR, height_jet, jet_weights
 from .._lifting.ring import RingTopology, angle_sums, lifted_ring, offsets, take_slots
-from .._lifting.schemes import Monotone
-from .._surface.building import CREASE
-from .._surface.surface import Surface, on_device, on_surface
+from .._surface import Surface, on_device, on_surface
+from .._surface.creases import CREASE
 from .._tables import AnyArray, Block, Table
-from .scalar import second_derivatives
 
 
 class Curvature(eqx.Module):
-    """How a surface bends. Positive where it bends away from the normal: a sphere of radius R has 1 / R.
+    """The curvature of a smooth surface, positive where it bends away from the normal: 1 / R on a sphere of radius R.
 
     Attributes:
         shape_operator: (V, 3, 3) the derivative of the normal, symmetric and tangent, in ambient coordinates.
-        mean: (V,) H, half its trace.
-        gauss: (V,) K, its determinant in the tangent plane.
-        principal: (V, 2) its eigenvalues, the larger first.
-        directions: (V, 2, 3) the unit tangent vectors they belong to.
+        mean: (V,) the mean curvature H, half the trace of the shape operator.
+        gauss: (V,) the Gauss curvature K, the determinant of the shape operator in the tangent plane.
+        principal: (V, 2) the principal curvatures, the larger first.
+        directions: (V, 2, 3) the principal directions, as unit tangent vectors.
     """
 
     shape_operator: Float[Array, "V 3 3"]
@@ -41,14 +39,13 @@ class Curvature(eqx.Module):
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
-    The result is of first order for ``Monotone`` on irregular meshes, and of order degree - 1 for ``Polynomial``.
-    ``Monotone`` fits in the tangent plane with chord lengths, whatever its lift, and is nearly exact on spheres. The
-    fits are made in float64 on the host, once for each surface; while a JAX transformation is tracing the surface they
-    are made in the widest float that is switched on, and in float32 they lose their accuracy at vertices whose edges
-    differ in length by more than three hundred times. Differentiable in the vertices, but for the principal directions
-    where both curvatures are equal. At a crease or a corner the curvature of the surface is not a number but a measure,
-    and the fit gives values that grow as the mesh is refined: take `polyhedral_curvature` there, and where the integral
-    has to be exact.
+    ``Monotone`` is first order on irregular meshes, ``Polynomial`` has order degree - 1. ``Monotone`` fits in the tangent
+    plane with chord lengths under every lift, and is nearly exact on spheres. The fits are computed in float64 on the
+    host, once per surface. While a JAX transformation is tracing the surface they are computed in the widest float type
+    that is switched on; in float32 they lose their accuracy at vertices whose edge lengths differ by a factor of more
+    than three hundred. The result is differentiable in the vertices, except for the principal directions where both
+    curvatures are equal. At a crease or a corner the curvature is a measure and not a function, and the fitted values
+    grow as the mesh is refined: use `polyhedral_curvature` there, or if the integral must be exact.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -64,25 +61,25 @@ def _curvature(surface: Surface, bending: Float[Array, "3 V"]) -> Curvature:
     frames, (xx, xy, yy) = surface.geometry.frames, bending
     mean, gauss = (xx + yy) / 2, xx * yy - xy**2
     half, squared = (xx - yy) / 2, ((xx - yy) / 2) ** 2 + xy**2
-    # Where both curvatures are equal the root has no derivative and the angle no value: any will do.
+    # If both curvatures are equal, the root has no derivative and the angle is arbitrary.
     is_umbilic = squared == 0
     root = jnp.where(is_umbilic, 0, jnp.sqrt(jnp.where(is_umbilic, 1, squared)))
     angle = jnp.arctan2(jnp.where(is_umbilic, 0, xy), jnp.where(is_umbilic, 1, half)) / 2
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    turned = jnp.stack([jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)], axis=1)
+    directions = jnp.stack([jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)], axis=1)
     components = jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
     return Curvature(
         shape_operator=jnp.einsum("abv,vac,vbd->vcd", components, frames, frames),
         mean=mean,
         gauss=gauss,
         principal=jnp.stack([mean + root, mean - root], axis=-1),
-        directions=jnp.einsum("vpa,vac->vpc", turned, frames),
+        directions=jnp.einsum("vpa,vac->vpc", directions, frames),
     )
 
 
 def _bending(surface: Surface) -> Float[Array, "3 V"]:
     """The second fundamental form xx, xy, yy in the frames."""
-    if not isinstance(surface.scheme, Monotone):
+    if not surface.scheme.is_monotone:
         return _bending_of_positions(surface)
     table, places = surface.topology.jet, (surface.vertices, surface.normals, surface.geometry.frames)
     if surface.is_traced:
@@ -99,33 +96,34 @@ def _bending(surface: Surface) -> Float[Array, "3 V"]:
 def _bending_of_heights(
     table: Table, vertices: Float[AnyArray, "V 3"], normals: Float[AnyArray, "V 3"], frames: Float[AnyArray, "V 2 3"]
 ) -> Float[AnyArray, "3 V"]:
-    """From quadratic fits of heights over chord lengths. Exact on a sphere if the normals are."""
+    """The second fundamental form from quadratic fits of heights, exact on a sphere if the normals are exact."""
 
     def bending(block):
-        seen = offsets(vertices, block)
-        weights = jet_weights(lifted_ring(seen, block.centre(frames), "chord"), 2)
-        return -height_jet(seen, block.centre(normals), weights)[2:].T
+        edges = offsets(vertices, block)
+        weights = jet_weights(lifted_ring(edges, block.centre(frames), "chord"), 2)
+        return -height_jet(edges, block.centre(normals), weights)[2:].T
 
     return table.map(bending).T
 
 
 def _bending_of_positions(surface: Surface) -> Float[Array, "3 V"]:
     """The second fundamental form xx, xy, yy in the frames, from the scheme's own second derivatives."""
-    parts = jnp.stack(second_derivatives(surface, surface.vertices))
+    parts = jnp.stack([stencil(surface.vertices) for stencil in surface.hessian_stencils])
     return -jnp.sum(parts * surface.normals[None], axis=-1)
 
 
 class PolyhedralCurvature(eqx.Module):
-    """The curvature of a polyhedron, which lies in its vertices and edges, spread over the vertex areas.
+    """The curvature of a polyhedron, which is concentrated in its vertices and edges, divided by the vertex areas.
 
     Attributes:
-        gauss: (V,) K, the angle defect 2 pi - T over the vertex area, T the sum of the angles of the faces at the
-            vertex; zero on the boundary.
-        mean: (V,) H, a quarter of the sum over edges of length times dihedral angle, over the vertex area. Positive
-            where the surface is convex, 1 / R on a sphere of radius R.
-        crease_mean: (V,) the part of ``mean`` that lies in creases, edges that turn by more than 40 degrees. It grows
-            as the mesh is refined; the rest converges.
-        turning: (V,) the angle pi - T by which a boundary turns at a vertex; zero inside. An angle, not a density.
+        gauss: (V,) the angle defect 2 pi - T over the vertex area, where T is the sum of the face angles at the vertex;
+            zero on the boundary.
+        mean: (V,) a quarter of the sum over edges of length times dihedral angle, over the vertex area. Positive where
+            the surface is convex, and 1 / R on a sphere of radius R.
+        crease_mean: (V,) the part of ``mean`` that comes from creases, edges with a dihedral angle of more than 40
+            degrees. This part grows as the mesh is refined; the remainder converges.
+        turning: (V,) the angle pi - T by which the boundary turns at a vertex, zero in the interior. It is an angle, not
+            a density.
     """
 
     gauss: Float[Array, " V"]
@@ -136,11 +134,11 @@ class PolyhedralCurvature(eqx.Module):
 
 @on_device
 def polyhedral_curvature(surface: Surface) -> PolyhedralCurvature:
-    """The curvature of a surface as the polyhedron it is, by angle defects and dihedral angles.
+    """The curvature of the mesh as a polyhedron, from angle defects and dihedral angles.
 
     Integrals are exact (Gauss and Bonnet): ``integrate(surface, gauss) + sum(turning)`` is 2 pi times the Euler
-    characteristic, whatever the mesh, and integrals over a region converge to those of the smooth surface. Values at
-    single vertices do not converge on irregular meshes, where `curvature` does. Differentiable in the vertices.
+    characteristic on every mesh, and integrals over a region converge to those of the smooth surface. Values at single
+    vertices do not converge on irregular meshes; those of `curvature` do. The result is differentiable in the vertices.
 
     Args:
         surface: a surface of any scheme.
@@ -159,14 +157,14 @@ def polyhedral_curvature(surface: Surface) -> PolyhedralCurvature:
     def sums(block, topology):
         return angle_sums(offsets(surface.vertices, block), topology)
 
-    def edges(block, topology):
-        length, turn = _dihedral(block, topology, surface.vertices)
-        bent = length * turn / 4
-        creased = jnp.where(jnp.abs(turn) > np.radians(CREASE), bent, 0)
-        return jnp.stack([jnp.sum(bent, axis=0), jnp.sum(creased, axis=0)], axis=-1)
+    def edge_sums(block, topology):
+        length, angle = _dihedral(block, topology, surface.vertices)
+        share = length * angle / 4
+        creased = jnp.where(jnp.abs(angle) > np.radians(CREASE), share, 0)
+        return jnp.stack([jnp.sum(share, axis=0), jnp.sum(creased, axis=0)], axis=-1)
 
     total = ring.map(sums, ring_blocks)
-    mean, crease = jnp.moveaxis(ring.map(edges, ring_blocks), -1, 0)
+    mean, crease = jnp.moveaxis(ring.map(edge_sums, ring_blocks), -1, 0)
     is_boundary = surface.topology.kinds != INTERIOR
     return PolyhedralCurvature(
         gauss=jnp.where(is_boundary, 0, 2 * jnp.pi - total) / areas,
@@ -179,18 +177,18 @@ def polyhedral_curvature(surface: Surface) -> PolyhedralCurvature:
 def _dihedral(
     block: Block, topology: RingTopology, vertices: Float[AnyArray, "V 3"]
 ) -> tuple[Float[Array, "K N"], Float[Array, "K N"]]:
-    """The length of the edge in every slot, and the angle between its two faces, zero where it has not two."""
-    seen = offsets(vertices, block)
-    slots = seen.shape[0]
+    """The length and the dihedral angle of the edge in every slot, both zero for edges without two proper faces."""
+    edges = offsets(vertices, block)
+    slots = edges.shape[0]
     following, preceding = topology.following(slots), topology.preceding(slots)
     slot = jnp.arange(slots, dtype=following.dtype)[:, None]
-    has_two = (following != slot) & ~(topology.is_boundary[None] & (slot == 0))
-    left = jnp.cross(seen, take_slots(seen, following))
-    right = jnp.cross(take_slots(seen, preceding), seen)
-    squared = jnp.sum(seen**2, axis=-1)
-    has_two &= (squared > 0) & (jnp.sum(left**2, axis=-1) > 0) & (jnp.sum(right**2, axis=-1) > 0)
-    length = jnp.sqrt(jnp.where(has_two, squared, 1))
-    # The sine is that of the turn about the edge, which is positive where the faces bend away from the normals.
-    sine = jnp.sum(jnp.cross(left, right) * seen, axis=-1) / length
-    turn = jnp.arctan2(jnp.where(has_two, sine, 0), jnp.where(has_two, jnp.sum(left * right, axis=-1), 1))
-    return jnp.where(has_two, length, 0), jnp.where(has_two, turn, 0)
+    is_interior = (following != slot) & ~(topology.is_boundary[None] & (slot == 0))
+    left = jnp.cross(edges, take_slots(edges, following))
+    right = jnp.cross(take_slots(edges, preceding), edges)
+    squared = jnp.sum(edges**2, axis=-1)
+    is_interior &= (squared > 0) & (jnp.sum(left**2, axis=-1) > 0) & (jnp.sum(right**2, axis=-1) > 0)
+    length = jnp.sqrt(jnp.where(is_interior, squared, 1))
+    # The sign of the angle: positive where the faces bend away from the normals.
+    sine = jnp.sum(jnp.cross(left, right) * edges, axis=-1) / length
+    angle = jnp.arctan2(jnp.where(is_interior, sine, 0), jnp.where(is_interior, jnp.sum(left * right, axis=-1), 1))
+    return jnp.where(is_interior, length, 0), jnp.where(is_interior, angle, 0)

@@ -11,8 +11,8 @@ from jaxtyping import Array, ArrayLike
 
 from .._base.arguments import as_numbers, at_least
 from .._equations import Equation
-from .._operators.elliptic import EllipticStencil
-from .._surface.surface import Surface
+from .._operators import EllipticStencil
+from .._surface import Surface
 from .._tables import AnyArray
 from .stabilised import Stabilised
 

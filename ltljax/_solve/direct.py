@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Int
 from .._base.cache import new_handle, release_with, value_of
 from .._equations import Diffusion, boundary as bounds
 from .._lifting.schemes import Paper
-from .._operators.scalar import laplacian_matrix
-from .._surface.surface import Surface, on_surface
+from .._operators import laplacian_matrix
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .evolve import what_is_fixed
 from .krylov import Preconditioner

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._lifting.delaunay import HalfEdges, delaunay_triangulation
 from .._lifting.jets import INTERIOR
-from .._surface.surface import Surface, on_surface
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 
 # A distance is corrected where it falls by more than this share, which is rounding.

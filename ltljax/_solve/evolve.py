@@ -19,8 +19,8 @@ from .._base.arguments import as_numbers
 from .._base.folder import Folder
 from .._equations import Equation, boundary as bounds
 from .._lifting.schemes import Monotone, Paper, Polynomial
-from .._operators.scalar import growth_rate, spectral_bound, spectral_width
-from .._surface.surface import Surface, on_surface
+from .._operators import growth_rate, spectral_bound, spectral_width
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks, taped
 from .fingerprint import fingerprint

@@ -14,10 +14,8 @@ import scipy.sparse
 from jaxtyping import Array, Float
 
 from .._equations import Dirichlet, Neumann
-from .._operators.curvature import curvature
-from .._operators.scalar import divergence, gradient
-from .._operators.tangent import check_vectors, curl, tangential
-from .._surface.surface import Surface, on_surface
+from .._operators import check_vectors, curl, curvature, divergence, gradient, tangential
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .direct import Factorized
 from .multigrid import Multigrid

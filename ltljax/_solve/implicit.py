@@ -19,8 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._equations import Equation
-from .._operators.scalar import diagonal
-from .._surface.surface import Surface
+from .._surface import Surface
 from .krylov import BiCGStab, Preconditioner, linear_solve, rms, unit_of
 from .multigrid import Multigrid
 
@@ -73,7 +72,7 @@ class Preconditioning(eqx.Module):
         """An approximate inverse of ``alpha - beta Delta``, with one alpha and one beta for every species."""
         if self.multigrid is not None:
             return Cycle(self.multigrid, alpha, beta)
-        return Jacobi(1 / (alpha[None] - beta[None] * diagonal(surface)[:, None]))
+        return Jacobi(1 / (alpha[None] - beta[None] * surface.laplacian_stencil.diagonal()[:, None]))
 
     def absolute(self, unit: Array) -> Array:
         """The absolute tolerance of each species, in units of their own."""

@@ -14,8 +14,8 @@ import scipy.sparse.linalg
 from jaxtyping import Array, Float
 
 from .._equations import boundary as bounds
-from .._operators.scalar import laplacian, laplacian_matrix
-from .._surface.surface import Surface, on_surface
+from .._operators import laplacian, laplacian_matrix
+from .._surface import Surface, on_surface
 
 # Below this size all eigenvalues are computed at once.
 _DENSE = 300

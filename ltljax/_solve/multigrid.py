@@ -27,8 +27,8 @@ from jaxtyping import Array, Float, Int
 from .._lifting.layout import PerBlock
 from .._lifting.schemes import Monotone
 from .._mesh import Mesh
-from .._operators.scalar import laplacian_matrix
-from .._surface.surface import Surface, on_surface
+from .._operators import laplacian_matrix
+from .._surface import Surface, on_surface
 from .._tables import (
     AnyArray,
     ReverseWeights,

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from .._equations import ReactionDiffusion
 from .._equations.kinetics import Kinetics
-from .._surface.surface import Surface, on_surface
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .modes import eigenmodes
 

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from .._equations import Diffusion, Equation, ReactionDiffusion, boundary as bounds
 from .._equations.spreads import are_numbers, spread_bound
 from .._lifting.schemes import Monotone, Paper, Polynomial
-from .._operators.scalar import spectral_bound
-from .._surface.surface import Surface, on_surface
+from .._operators import spectral_bound
+from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks
 from .direct import Factorized, factor

@@ -18,9 +18,8 @@ from jaxtyping import Array, Float, Int
 from .._equations import VectorDiffusion
 from .._lifting.frames import transport
 from .._mesh import k_ring, one_rings
-from .._operators.scalar import laplacian_matrix
-from .._operators.tangent import check_tangent, connection, from_frame, power, to_frame
-from .._surface.surface import Surface, on_surface
+from .._operators import check_tangent, connection, from_frame, laplacian_matrix, power, to_frame
+from .._surface import Surface, on_surface
 from .._tables import AnyArray, difference_matrix
 from .distance import checked_sources
 from .evolve import solve

@@ -1,10 +1,11 @@
-"""Padded neighbour tables, and the one loop everything runs through: a weighted sum over the slots of a row.
+"""Padded neighbour tables, and the one loop that everything runs through: a weighted sum over the slots of a row.
 
-What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and sums over its slots with all
-their derivatives. Knows no geometry.
+What enters: rows of neighbours of any length, on the host. What leaves: a `Table`, and a `Stencil` of weights on it: a
+linear operator with all derivatives. This room knows no geometry.
 """
 
 from .contraction import difference_sum, differences
+from .stencil import ComposedStencil, Mean, Stencil
 from .table import (
     AnyArray,
     Block,
@@ -25,8 +26,11 @@ from .table import (
 __all__ = [
     "AnyArray",
     "Block",
+    "ComposedStencil",
+    "Mean",
     "Reverse",
     "ReverseWeights",
+    "Stencil",
     "Table",
     "build_table",
     "coordinates",

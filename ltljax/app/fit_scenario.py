@@ -18,7 +18,7 @@ from .._base.progress import noted
 from .._fit import Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
 from .._lifting.schemes import Scheme
 from .._solve.restart import RestartError
-from .._surface.surface import FarFromOriginWarning, Surface
+from .._surface import FarFromOriginWarning, Surface
 from .scenario import Places, Scenario, ScenarioError, Wanted
 
 _RESULTS = ("fit.json", "fitted.toml", "fit.png")

@@ -24,11 +24,11 @@ from .._base.folder import Folder, OutputError, copies
 from .._base.progress import noted, watched
 from .._lifting.schemes import Monotone, Scheme
 from .._mesh import Mesh, vertex_normals
-from .._operators.scalar import integrate
+from .._operators import integrate
 from .._solve import GrowingModesWarning, SolveError, solve
 from .._solve.fingerprint import fingerprint
 from .._solve.restart import Keeper
-from .._surface.surface import FarFromOriginWarning, Surface
+from .._surface import FarFromOriginWarning, Surface
 from .scenario import Scenario
 
 _PACKAGES = ("ltljax", "jax", "jaxlib", "numpy", "scipy", "trimesh", "equinox", "diffrax", "pyvista")

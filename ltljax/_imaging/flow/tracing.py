@@ -13,8 +13,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._operators.tangent import check_tangent
-from ..._surface.surface import Surface, on_surface
+from ..._operators import check_tangent
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from ..._tables.table import take
 from .walking import CORNERS, faces_along, start, walk

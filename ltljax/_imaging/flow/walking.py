@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._surface.surface import Surface
+from ..._surface import Surface
 from ..._tables.table import take
 
 # Shorter than this share of the longest vector a vector has no direction.

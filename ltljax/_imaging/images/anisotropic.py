@@ -14,9 +14,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..._equations import Equation
-from ..._operators.elliptic import EllipticStencil, elliptic_stencil
-from ..._operators.scalar import divergence, gradient
-from ..._surface.surface import Surface, on_device, on_surface
+from ..._operators import EllipticStencil, divergence, elliptic_stencil, gradient
+from ..._surface import Surface, on_device, on_surface
 from ..._tables import AnyArray
 from .signals import number, signal
 from .smoothing import evolved, smoothed

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .signals import check, number, signal
 from .smoothing import mean_after

@@ -13,10 +13,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..._equations import Dirichlet
-from ..._operators.scalar import diagonal, laplacian
+from ..._operators import laplacian
 from ..._solve.direct import Factorized, factorized
 from ..._solve.stationary import poisson
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .minimiser import Faces, Functional, conjugate_gradients, minimise
 from .signals import check, missing, signal
@@ -94,7 +94,7 @@ def _biharmonic(surface: Surface, u: Array, mask: Array, inverse: Factorized | N
 
     def about_inverse(r):
         if inverse is None:
-            return r / (free * areas * diagonal(surface)[:, None] ** 2 + (1 - free))
+            return r / (free * areas * surface.laplacian_stencil.diagonal()[:, None] ** 2 + (1 - free))
         there = inverse(free * r, True) * free / areas
         return free * inverse(there, False) + (1 - free) * r
 

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._surface.surface import Surface
+from ..._surface import Surface
 
 # Linear systems are solved to this share of their right side within Newton's method, and to this one for derivatives.
 _FORCING = 1e-2

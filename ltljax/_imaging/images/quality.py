@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .signals import number, same_shape, signal
 from .smoothing import smoothed

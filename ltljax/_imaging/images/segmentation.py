@@ -13,10 +13,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from ..._operators.scalar import diagonal, laplacian
+from ..._operators import laplacian
 from ..._solve.implicit import Jacobi
 from ..._solve.krylov import linear_solve
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .signals import check, number, signal
 
@@ -122,7 +122,7 @@ def _segmented(
         return 2 / width + jnp.sum(misfits(phi), axis=0)
 
     def inverse(stiffness: Array) -> Jacobi:
-        return Jacobi(1 / (stiffness - width * diagonal(surface))[:, None])
+        return Jacobi(1 / (stiffness - width * surface.laplacian_stencil.diagonal())[:, None])
 
     def step(carry):
         phi, _, steps = carry

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._base.arguments import as_numbers
 from ..._solve.evolve import SolveError
-from ..._surface.surface import Surface
+from ..._surface import Surface
 from ..._tables import AnyArray
 
 

@@ -13,12 +13,12 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from ..._equations import Diffusion, Equation
-from ..._operators.scalar import diagonal, gradient, laplacian, spectral_bound, weighted_laplacian
+from ..._operators import gradient, laplacian, spectral_bound, weighted_laplacian
 from ..._solve.evolve import solve
 from ..._solve.implicit import Jacobi
 from ..._solve.krylov import linear_solve
 from ..._solve.stabilised import RKL1
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .signals import check, number, signal
 
@@ -63,7 +63,7 @@ def mean_after(
     """The image after one implicit step of diffusion over a time, half the square of a window's radius, and whether
     it was found."""
     half = jnp.asarray(time, u.dtype)
-    inverse = Jacobi(1 / (1 - half * diagonal(surface)[:, None]))
+    inverse = Jacobi(1 / (1 - half * surface.laplacian_stencil.diagonal()[:, None]))
     share = _EXACT[jnp.dtype(u.dtype)]
     # For what is added to u, so that constants stay as they are, to the last digit.
     change = half * laplacian(surface, u)

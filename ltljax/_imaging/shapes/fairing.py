@@ -15,12 +15,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..._equations import Diffusion, Dirichlet
-from ..._operators.scalar import diagonal, laplacian
+from ..._operators import laplacian
 from ..._solve import Multigrid, SolveError
 from ..._solve.evolve import hierarchy
 from ..._solve.implicit import Cycle, Jacobi
 from ..._solve.krylov import Preconditioner, linear_solve
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .volume import check_volume, volumes, with_volumes
 
@@ -210,7 +210,7 @@ class _Twice(Preconditioner):
 
 def _inverse(surface: Surface, strength: Array, order: int, multigrid: Multigrid | None) -> Preconditioner:
     if multigrid is None:
-        own: Any = diagonal(surface)
+        own: Any = surface.laplacian_stencil.diagonal()
         return Jacobi(1 / (1 - strength * own if order == 1 else 1 + strength * own**2)[:, None])
     one = jnp.ones(3, strength.dtype)
     return Cycle(multigrid, one, strength * one) if order == 1 else _Twice(Cycle(multigrid, one, strength**0.5 * one))

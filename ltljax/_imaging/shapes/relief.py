@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._operators.curvature import curvature
-from ..._operators.scalar import gradient, hessian
-from ..._surface.surface import Surface, on_device, on_surface
+from ..._operators import curvature, gradient, hessian
+from ..._surface import Surface, on_device, on_surface
 from ..._tables import AnyArray
 from ..images.signals import number
 

@@ -13,7 +13,7 @@ import scipy.sparse
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..._surface.surface import Surface, on_surface
+from ..._surface import Surface, on_surface
 from ..._tables import AnyArray, Table, build_table, difference_sum, differences, reversible, slot_sum
 from ..._tables.table import take
 

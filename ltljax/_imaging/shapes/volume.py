@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..._surface.surface import Surface
+from ..._surface import Surface
 from ..._tables import AnyArray
 
 # Newton's method on a cubic that is nearly straight: each step doubles the digits.

@@ -10,10 +10,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from ..._lifting.frames import transport
-from ..._operators.curvature import curvature
-from ..._operators.tangent import rotated, tangential
+from ..._operators import curvature, rotated, tangential
 from ..._solve import direction_field
-from ..._surface.surface import Surface
+from ..._surface import Surface
 from .subject import Subject
 
 FIELDS = ("smallest", "largest", "cross", "rotation")

@@ -12,7 +12,7 @@ import numpy as np
 from ... import imaging
 from ..._imaging.images.variation import deviation
 from ..._mesh.columns import DataError, colors_of, from_zero_to_one, read_colors, read_columns
-from ..._operators.scalar import gradient
+from ..._operators import gradient
 from .results import Results, usual
 from .subject import Subject, check_choice, check_positive, load
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ... import imaging
 from ..._mesh.columns import read_colors
-from ..._operators.curvature import curvature as curvature_of
+from ..._operators import curvature as curvature_of
 from ..._solve import geodesic_distance
 from .fields import FIELDS, line_fields
 from .results import Results, symmetric, usual

@@ -12,7 +12,7 @@ import numpy as np
 from ..._base.progress import noted
 from ..._lifting.schemes import Monotone
 from ..._mesh import Mesh, load_mesh, shapes
-from ..._surface.surface import FarFromOriginWarning, Surface
+from ..._surface import FarFromOriginWarning, Surface
 
 # Vertices from which on building a surface takes long enough to be watched.
 _LONG_BUILD = 100_000

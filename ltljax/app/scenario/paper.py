@@ -9,8 +9,8 @@ import numpy as np
 from ..._equations import Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
 from ..._lifting.schemes import Monotone
 from ..._mesh import Mesh, load_mesh, shapes
-from ..._operators.scalar import integrate
-from ..._surface.surface import Surface
+from ..._operators import integrate
+from ..._surface import Surface
 from .scenario import Options, Scenario, Settings, scaled_to_unit_area
 
 BUILT_IN = ("sphere", "torus", "disk", "box")

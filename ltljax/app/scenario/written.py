@@ -20,12 +20,11 @@ import numpy as np
 
 from ..._equations import CahnHilliard, Diffusion, Equation, ReactionDiffusion, kinetics
 from ..._mesh import Mesh, MeshError, load_mesh, shapes
-from ..._operators.curvature import curvature
-from ..._operators.elliptic import direction_tensor, elliptic_stencil
+from ..._operators import curvature, direction_tensor, elliptic_stencil
 from ..._output.colors import COLORMAPS
 from ..._output.pictures import VIEWS
 from ..._solve import RKL1, RKL2, SBDF2, TRBDF2, BackwardEuler, CrankNicolson, solve
-from ..._surface.surface import Surface
+from ..._surface import Surface
 from .formulas import Formula, cut
 from .inputs import arrays, check_self_contained
 from .observed import wanted
