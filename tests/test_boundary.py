@@ -212,3 +212,14 @@ def test_rows_at_corners_of_any_angle_are_non_negative_and_exact_for_what_can_ha
     linear = points @ np.array([2.0, -3.0])
     flux = np.broadcast_to([2.0, -3.0, 0.0], (len(points), 3))
     assert float(ltl.laplacian(surface, linear, flux)[0]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("lift", ["intrinsic", "chord"])
+def test_linear_fields_have_their_exact_gradient_where_the_boundary_is_spaced_unevenly(lift):
+    mesh = ltl.shapes.disk(rings=4)
+    radius, angle = np.hypot(*mesh.vertices[:, :2].T), np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0])
+    angle = angle + 0.4 * np.sin(angle)
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * radius], axis=1)
+    surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, mesh.faces), ltl.Monotone(lift=lift))
+    expected = np.broadcast_to([1.0, 0.0, 0.0], vertices.shape)
+    np.testing.assert_allclose(ltl.gradient(surface, surface.vertices[:, 0]), expected, atol=1e-12)

@@ -246,6 +246,12 @@ def test_a_row_of_a_thousand_neighbours_is_not_unrolled():
         assert len(re.findall(r"\bgather\(", jax.jit(function).lower(u).compile().as_text())) < 100
 
 
+def test_a_row_of_a_thousand_neighbours_has_the_sum_of_the_dense_form():
+    table, random = table_of([list(range(1, 1001)), *[[0]] * 1000]), np.random.default_rng(0)
+    weights, u = weights_of(table, random), random.normal(size=1001)
+    np.testing.assert_allclose(difference_sum(table, weights, u), dense_of(table, weights) @ u, atol=1e-9)
+
+
 ON_TWO_DEVICES = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import PartitionSpec as P

@@ -115,6 +115,18 @@ def test_paths_bend_at_holes_and_corners(is_outside, num_sources):
         assert np.abs(error).max() < 0.33 * mesh.mesh_size
 
 
+def test_paths_bend_around_the_end_of_a_slit():
+    square = ltl.shapes.jittered(ltl.shapes.square(n=20), 0.3, seed=2)
+    x, y = square.vertices[square.faces].mean(axis=1)[:, :2].T
+    faces = square.faces[~((np.abs(x - 0.5) < 0.06) & (y > 0.3))]
+    used, faces = np.unique(faces, return_inverse=True)
+    mesh = ltl.Mesh(square.vertices[used], faces.reshape(-1, 3), repair=True)
+    surface = ltl.Surface.from_mesh(mesh)
+    source = np.random.default_rng(3).choice(mesh.num_vertices, 1, replace=False)
+    error = ltl.geodesic_distance(surface, source) - ltl.geodesic_distance(surface, source, "exact")
+    assert np.abs(error).max() < 0.33 * mesh.mesh_size
+
+
 def test_distances_do_not_depend_on_the_numbering():
     mesh = ltl.shapes.jittered_torus(18, 9, 0.3, seed=0)
     order = np.random.default_rng(0).permutation(mesh.num_vertices)

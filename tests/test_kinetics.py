@@ -41,6 +41,25 @@ def test_rates_vanish_at_the_steady_state(name):
     np.testing.assert_allclose(kinetics(state[None]), 0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "state", "expected"),
+    [
+        ("gray_scott", (0.5, 0.25), (-0.01125, 0.00625)),
+        ("schnakenberg", (1.0, 1.0), (10.0, -10.0)),
+        ("brusselator", (1.0, 1.0), (-7.2, 9.2)),
+        ("barkley", (0.5, 0.1), (4.25, 0.4)),
+        ("fitzhugh_nagumo", (1.0, 0.5), (-0.5, 5.5)),
+        ("allen_cahn", (0.5,), (0.375,)),
+        ("ginzburg_landau", (1.0, 2.0), (11.0, -15.5)),
+        ("fisher_kpp", (0.25,), (0.1875,)),
+        ("lotka_volterra", (2.0, 3.0), (-4.0, 3.0)),
+    ],
+)
+def test_rates_away_from_the_steady_state_have_the_values_of_their_formulas(name, state, expected):
+    rates = getattr(ltl.kinetics, name)()(jnp.array([state]))
+    np.testing.assert_allclose(rates[0], expected, rtol=1e-12)
+
+
 def test_the_steady_state_of_fitzhugh_and_nagumo_moves_with_the_offset():
     for offset in (-0.3, 0.2):
         kinetics = ltl.kinetics.fitzhugh_nagumo(offset=offset)

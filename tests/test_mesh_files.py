@@ -688,10 +688,11 @@ def test_a_polygon_that_winds_around_a_corner_or_runs_back_on_itself_is_refused(
             triangulated(points, np.arange(len(points)), [len(points)])
 
 
-@pytest.mark.parametrize("head", ["OFF", "COFF", "NOFF"])
-def test_off_numbers_may_flow_over_lines(tmp_path, head):
+@pytest.mark.parametrize(
+    ("head", "extra"), [("OFF", ""), ("COFF", " 255 0 0 255"), ("COFF", " 255 0 0"), ("NOFF", " 0 0 1")]
+)
+def test_off_numbers_may_flow_over_lines(tmp_path, head, extra):
     shape = shapes.icosphere(1)
-    extra = {"OFF": "", "COFF": " 255 0 0 255", "NOFF": " 0 0 1"}[head]
     rows = [f"{x!r} {y!r} {z!r}{extra}" for x, y, z in shape.vertices.tolist()]
     rows += [f"3 {a} {b} {c}" for a, b, c in shape.faces.tolist()]
     text = f"{head}\n{shape.num_vertices} {shape.num_faces} 0\n" + "\n".join(

@@ -146,6 +146,12 @@ def test_a_mesh_of_the_command_line_comes_first_and_changes_after(tmp_path):
     assert found.resolved["mesh"]["scale"] == "keep"
 
 
+def test_a_mesh_file_is_scaled_to_the_area_of_the_unit_sphere(tmp_path):
+    saved_ball(tmp_path / "ball.obj")
+    mesh = scenario.read(PLAIN, "ball", tmp_path, {}, tmp_path / "ball.obj").mesh
+    assert mesh.area == pytest.approx(4 * np.pi, rel=1e-6)
+
+
 def test_a_built_in_mesh_takes_changes(tmp_path, no_pictures):
     arguments = ["--mesh", "sphere", "--set", "mesh.subdivisions=2", "--t1", "0.1", "--frames", "1"]
     assert main(["run", "lotka-volterra", *arguments, "--out", str(tmp_path)]) == 0
