@@ -1,22 +1,23 @@
-"""The hot loop: a trilinear form over the slots of a table, what it is with one argument left open, and derivatives.
+"""The hot loop: a trilinear form over the slots of a table, and all of its derivatives.
 
     T(w, u, y) = sum_v y[v] sum_k w[k, v] (u[neighbour k of v] - u[v])
 
-With y left open it is the weighted sum of differences, applied to the field u; with u left open the transpose of that,
-applied to y; with w left open the derivative with respect to the weights. Derivatives of each are again T with one
-argument left open: the product rule fills a tangent in, and a transpose puts the cotangent where the output was and
-leaves open what was linear. So one primitive holds every derivative of every order, and because each of its three
-forms gathers (the transpose over the table's reverse, where there is one) no derivative ever adds by scattering.
+T is linear in each argument, so leaving one argument open gives a linear map into the space of that argument. With y
+open, it is the weighted sum of differences of u; with u open, the transpose of that sum, applied to y; with w open, the
+derivative with respect to the weights. The derivatives of each form are again T with one argument open: the product
+rule replaces an argument by its tangent, and a transpose replaces the open argument by the cotangent and opens the
+argument that was linear. One primitive therefore has derivatives of every order. All three forms gather (the transpose
+by means of the table's reverse), so no derivative scatters.
 
 Why the loop has this shape (CPU, two cores; docs/hot_loop.md has the figures):
 
-- Slot-major and unrolled over slots, a sum is one kernel: one pass over indices and weights, no (K, N) intermediate.
-- Differences, not a matrix with a diagonal: rounding is then relative to u[k] - u[v], which float32 needs on fine
-  meshes.
-- What goes in and what comes out is settled in memory. Left to itself XLA fuses whatever computes u into every one of
-  the K gathers and computes it K times; two sums in a row take four times as long as they should, a Runge-Kutta step
-  with its derivative forty times.
-- Indices are promised to be in bounds and not negative: the check for negative ones alone takes a fifth of the time.
+- A slot-major sum that is unrolled over slots compiles to one kernel, with one pass over indices and weights and no
+  (K, N) intermediate.
+- It sums differences, and not the entries of a matrix with a diagonal. Rounding errors are then relative to
+  u[k] - u[v], which float32 needs on fine meshes.
+- Inputs and outputs are held in memory. Otherwise XLA fuses the computation of u into each of the K gathers and repeats
+  it K times: two consecutive sums take four times as long, and a Runge-Kutta step with its derivative forty times.
+- Indices are promised to be in bounds and non-negative: the check for negative indices alone takes a fifth of the time.
 """
 
 import functools
@@ -32,8 +33,8 @@ from jaxtyping import Array, Float
 
 from .table import AnyArray, Block, ReverseWeights, Table, reverse_weights, take
 
-# Beyond so many slots, of few rows or of any, a loop unrolled over slots costs more compile time than it is worth. One
-# that is not takes ten times as long (the coarse levels of multigrid are wide, and made a cycle twice as long).
+# The loop is unrolled up to this many slots, or up to the larger number if there are many rows. An unrolled loop is ten
+# times as fast, which the wide coarse levels of multigrid need, but takes longer to compile.
 _UNROLL, _UNROLL_MANY = 32, 64
 _MANY = 256
 
@@ -42,7 +43,7 @@ _ARGUMENTS: tuple[Argument, ...] = ("weights", "field", "rows")
 
 
 class _Operands(NamedTuple):
-    """The arguments of T; the one left open is None. The reverse of the weights may be there or not."""
+    """The arguments of T; the open one is None. The reverse of the weights is optional."""
 
     table: Table
     weights: Any = None
@@ -60,8 +61,8 @@ def difference_sum(
         table: the neighbours.
         weights: one array (K, N) per block of the table.
         u: (V,) or (V, S).
-        reverse: what `reverse_weights` makes of these weights, where it is at hand; derivatives in reverse mode compute
-            it where it is not. Its own derivative is not taken: it counts as a function of the weights.
+        reverse: the result of `reverse_weights` for these weights, if it is known; otherwise reverse-mode derivatives
+            compute it. It counts as a function of the weights, so no derivative is taken with respect to it.
     """
     dtype = jnp.result_type(u, *weights)
     weights = tuple(jnp.asarray(block, dtype) for block in weights)
@@ -71,16 +72,16 @@ def difference_sum(
 
 
 def differences(table: Table, u: Float[AnyArray, " V"]) -> tuple[Array, ...]:
-    """``u[neighbour] - u[v]`` in every slot, one array per block; zero in an empty slot."""
+    """``u[neighbour] - u[v]`` in every slot, one array (K, N) per block; zero in an empty slot."""
     u = jnp.asarray(u)
     if u.ndim != 1:
         raise ValueError(
-            f"Expected one field of shape (V,), found {u.shape}: take the differences of each field apart."
+            f"Expected one field of shape (V,), found {u.shape}. Take the differences of each field separately."
         )
     return tuple(_contract(_Operands(table, field=u, rows=jnp.ones_like(u)), "weights"))
 
 
-# Levels of batching, outermost first; each has its size and the names of the operands with an axis for it, in front.
+# Levels of batching, outermost first: the size of each and the names of the operands with a leading axis for it.
 _Levels = tuple[tuple[int, frozenset[str]], ...]
 
 
@@ -90,51 +91,51 @@ def _contract(operands: _Operands, open_: Argument, levels: _Levels = ()) -> lis
 
 
 def _varying(leaves: list[Any]) -> list[Any]:
-    """The leaves, inside `jax.shard_map` all varying over the axes that one of them varies over.
+    """The leaves, cast so that inside `jax.shard_map` all of them vary over the same axes.
 
-    Operations of JAX see to that themselves, and so sum the cotangents of what was the same on every device; a
-    primitive must be handed it.
+    JAX's own operations cast their arguments, and so sum the cotangents of replicated arguments over the devices. A
+    primitive must be given arguments that are cast already.
     """
-    axes = [jax.typeof(leaf).mat.varying for leaf in leaves]
-    wanted = frozenset().union(*axes)
+    axes_of_leaves = [jax.typeof(leaf).mat.varying for leaf in leaves]
+    all_axes = frozenset().union(*axes_of_leaves)
     return [
-        jax.lax.pcast(leaf, tuple(wanted - here), to="varying") if wanted - here else leaf
-        for leaf, here in zip(leaves, axes, strict=True)
+        jax.lax.pcast(leaf, tuple(all_axes - axes), to="varying") if all_axes - axes else leaf
+        for leaf, axes in zip(leaves, axes_of_leaves, strict=True)
     ]
 
 
 def _evaluate(*leaves, structure, open_: Argument, levels: _Levels, settle: Callable[..., Any]) -> list[Array]:
-    """The contraction in plain JAX: what the primitive computes, abstractly and compiled."""
+    """The contraction in plain JAX, from which the primitive's abstract evaluation and compilation follow."""
     function = functools.partial(_form, open_=open_, settle=settle)
     for size, level in reversed(levels):
         axes: Any = _Operands._make(0 if name in level else None for name in _Operands._fields)
         function = jax.vmap(function, in_axes=(axes,), axis_size=size)
-    # As JAX's arrays: those of NumPy are for the host, which works on them piece by piece.
+    # Convert to JAX arrays, since NumPy arrays would be processed in pieces on the host.
     return function(structure.unflatten(map(jnp.asarray, leaves)))
 
 
 def _form(operands: _Operands, open_: Argument, settle: Callable[..., Any]) -> list[Array]:
     table, weights, u, y, reverse = operands
-    here = functools.partial(settle, table)
+    hold = functools.partial(settle, table)
     if open_ == "weights":
-        return here(table.each(functools.partial(_products, u=here(u), y=here(y))))
+        return hold(table.each(functools.partial(_products, u=hold(u), y=hold(y))))
     if open_ == "rows":
-        return here([table.map(functools.partial(_row_sums, u=here(u)), weights)])
+        return hold([table.map(functools.partial(_row_sums, u=hold(u)), weights)])
     if table.reverse is None:
-        return here(_scattered(table, weights, here(y)))
-    reverse, y = here(reverse_weights(table, weights)) if reverse is None else reverse, here(y)
+        return hold(_scattered(table, weights, hold(y)))
+    reverse, y = hold(reverse_weights(table, weights)) if reverse is None else reverse, hold(y)
     transposed = table.reverse.users.map(functools.partial(_row_sums, u=y), reverse.slots)
-    return here([transposed + _over_species(reverse.imbalance, y) * y])
+    return hold([transposed + _over_species(reverse.imbalance, y) * y])
 
 
 def _settled(table: Table, values: Any) -> Any:
-    """The same values, held in memory: XLA fuses nothing across."""
+    """The values, held in memory so that XLA fuses nothing across this point."""
     del table
     return jax.lax.optimization_barrier(values)
 
 
 def _settled_on_cpu(table: Table, values: Any) -> Any:
-    """The same, by a loop that is never entered; that no index is negative the compiler cannot know."""
+    """The same by a loop that is never entered: the compiler cannot know that no index is negative."""
     start = (table.blocks[0].indices[0, 0], values)
     return jax.lax.while_loop(
         lambda state: state[0] < 0, lambda state: (state[0] + 1, jax.tree.map(jnp.negative, state[1])), start
@@ -142,7 +143,7 @@ def _settled_on_cpu(table: Table, values: Any) -> Any:
 
 
 def _scattered(table: Table, weights: Any, y: Any) -> list[Array]:
-    """The transpose without a reverse."""
+    """The transposed sum for a table without reverse, which scatters."""
     forward = lambda u: table.map(functools.partial(_row_sums, u=u), weights)  # noqa: E731
     return list(jax.linear_transpose(forward, jax.ShapeDtypeStruct(y.shape, y.dtype))(y))
 
@@ -151,7 +152,7 @@ def _row_sums(block: Block, weights: Array, u: Array) -> Array:
     centre = block.centre(u)
     if not _is_unrolled(block):
         return jnp.sum(_over_species(weights, u) * (block.neighbours(u) - centre[None]), axis=0)
-    # Unrolled, the slots fuse into one pass over u with no (K, N) intermediate.
+    # The unrolled slots fuse into one pass over u, without a (K, N) intermediate.
     total = jnp.zeros_like(centre)
     for slot in range(weights.shape[0]):
         total = total + _over_species(weights[slot], u) * (take(u, block.indices[slot]) - centre)
@@ -164,11 +165,11 @@ def _is_unrolled(block: Block) -> bool:
 
 
 def _products(block: Block, u: Array, y: Array) -> Array:
-    here, centre = block.centre(y), block.centre(u)
+    own, centre = block.centre(y), block.centre(u)
     if not _is_unrolled(block):
-        return jnp.sum(here[None] * (block.neighbours(u) - centre[None]), axis=tuple(range(2, u.ndim + 1)))
+        return jnp.sum(own[None] * (block.neighbours(u) - centre[None]), axis=tuple(range(2, u.ndim + 1)))
     species = tuple(range(1, u.ndim))
-    return jnp.stack([jnp.sum(here * (take(u, neighbours) - centre), axis=species) for neighbours in block.indices])
+    return jnp.stack([jnp.sum(own * (take(u, neighbours) - centre), axis=species) for neighbours in block.indices])
 
 
 def _over_species(weights: Array, u: Array) -> Array:
@@ -177,10 +178,10 @@ def _over_species(weights: Array, u: Array) -> Array:
 
 contraction_p = Primitive("table_contraction")
 contraction_p.multiple_results = True
-# Alone, outside of jit, there is nothing to be fused with.
+# Outside of jit there is nothing to fuse with.
 _evaluate_alone = functools.partial(_evaluate, settle=lambda table, values: values)
 contraction_p.def_impl(jax.jit(_evaluate_alone, static_argnames=("structure", "open_", "levels")))
-# On CPU these releases drop barriers before they fuse; the loop that holds there costs a copy of u.
+# On CPU these releases of JAX drop optimization barriers before fusion; the loop used instead costs a copy of u.
 _DROPS_BARRIERS = jax.__version_info__ < (0, 11)
 for platform, settle in ((None, _settled), ("cpu", _settled_on_cpu))[: 1 + _DROPS_BARRIERS]:
     lowering = mlir.lower_fun(functools.partial(_evaluate, settle=settle), multiple_results=True)
@@ -194,14 +195,14 @@ def _(*leaves, **params):
 
 
 def _by_name(structure, values) -> dict[str, list[Any]]:
-    """Values given for each leaf, for each operand."""
+    """One value per leaf, grouped by operand."""
     values = iter(values)
     children = zip(_Operands._fields, structure.children(), strict=True)
     return {name: list(itertools.islice(values, child.num_leaves)) for name, child in children}
 
 
 def _filled(operands: _Operands, name: Argument, values: list[Any], open_: Argument) -> _Operands:
-    """The operands with one argument filled in and one left open; other weights have another reverse."""
+    """The operands with one argument filled in and another one opened; the reverse of other weights is dropped."""
     value = tuple(values) if name == "weights" else values[0]
     operands = operands._replace(**{open_: None, name: value})
     return operands._replace(reverse=None) if "weights" in (name, open_) else operands
@@ -228,16 +229,18 @@ def _transpose(cotangents, *primals, structure, open_, levels):
         cotangents = [ad.instantiate_zeros(part) for part in cotangents]
         operands = _filled(structure.unflatten(primals), open_, cotangents, linear)
         parts = _contract(operands, linear, tuple((size, level - {linear} | {open_}) for size, level in levels))
-        # Where the linear argument had no axis for a level, all of the level add up in it.
+        # If the linear argument has no axis for a level, its cotangents are summed over the level.
         shared = tuple(axis for axis, (_, level) in enumerate(levels) if linear not in level)
         parts = [jnp.sum(part, axis=shared) for part in parts] if shared else parts
-    found = iter(parts)
-    return [next(found) if name == linear else None for name, leaves in by_name.items() for _ in leaves]
+    cotangent_parts = iter(parts)
+    return [next(cotangent_parts) if name == linear else None for name, leaves in by_name.items() for _ in leaves]
 
 
 def _batch(leaves, axes, *, structure, open_, levels):
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
-    batched = frozenset(name for name, here in _by_name(structure, axes).items() if any(a is not None for a in here))
+    batched = frozenset(
+        name for name, own in _by_name(structure, axes).items() if any(axis is not None for axis in own)
+    )
     names = [
         name
         for name, child in zip(_Operands._fields, structure.children(), strict=True)

@@ -1,13 +1,13 @@
 """Padded neighbour tables: rows of neighbours of any length become a few arrays of fixed width.
 
 Tables are slot-major: ``indices[k, v]`` is the neighbour of vertex v in slot k. An empty slot holds v's own index and
-weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few rows longer than
-most do not widen the table: the bulk has the width that costs the least memory, and longer rows live in tail blocks,
-of which at most half is padding. Small ones are then joined with the next wider, which adds at most a twentieth of the
+weight 0, so a sum of ``w * (u[neighbour] - u[v])`` needs no mask and has finite derivatives. A few long rows do not
+widen the whole table: the bulk has the width that needs the least memory, and longer rows are in tail blocks, of which
+at most half is padding. A small tail block is joined with the next wider one, which adds at most a twentieth of the
 bulk.
 
-A table can carry its reverse: for every vertex, the rows that use it. With it a transposed sum gathers, where the plain
-transpose of a gather would scatter, which is several times slower.
+A table can carry its reverse: for every vertex, the rows that use it. With the reverse a transposed sum gathers; the
+plain transpose of a gather scatters, which is several times slower.
 """
 
 from collections.abc import Callable
@@ -19,43 +19,48 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
-# Tables are built and weighed on the host in NumPy, and used on the device; code that serves both asks the array for
-# its namespace (`x.__array_namespace__()`, the array API standard). A type checker cannot follow which of the two an
-# array is; while the tests run it is checked to be one of them.
+# Tables are built and weighed on the host in NumPy and used on the device. Code for both asks the array for its
+# namespace (`x.__array_namespace__()`, the array API standard). A type checker cannot tell which of the two an array
+# is; with LTLJAX_CHECK_SHAPES=1 the tests check that it is one of them.
 if TYPE_CHECKING:
     AnyArray = Any
 else:
     AnyArray = Array | np.ndarray
 
-# Rows at once on the host.
+# Number of rows that the host processes at once.
 _PIECE = 1 << 13
 
 
 def take(values: AnyArray, indices: AnyArray) -> AnyArray:
-    """The values at indices the host has checked, so that XLA needs no checks for bounds or for negative indices."""
+    """The values at indices that the host has checked, so that XLA checks neither bounds nor signs."""
     if isinstance(values, np.ndarray):
         return values[indices]
     return values.at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 class Block(eqx.Module):
-    """Rows of one width. ``rows`` is None for the bulk, which has a row for every vertex in order."""
+    """Rows of one width.
+
+    Attributes:
+        indices: the neighbour in each slot of each row.
+        rows: the vertex of each row; None for the bulk, which has a row for every vertex in order.
+    """
 
     indices: Int[AnyArray, "K N"]
     rows: Int[AnyArray, " N"] | None
 
     @property
     def is_used(self) -> AnyArray:
-        """Which slots hold a neighbour, (K, N) bool: an empty one holds its own row."""
+        """Whether each slot holds a neighbour, (K, N) bool; an empty slot holds the row's own vertex."""
         own = np.arange(self.indices.shape[1], dtype=np.int32) if self.rows is None else self.rows
         return self.indices != own[None]
 
     def part(self, columns: Int[AnyArray, " n"]) -> "Block":
-        """The block of some of its columns."""
+        """The block with a selection of its columns."""
         return Block(self.indices[:, columns], columns if self.rows is None else self.rows[columns])
 
     def centre(self, values: AnyArray) -> AnyArray:
-        """The values at this block's own rows: (V, ...) -> (N, ...)."""
+        """The values at the vertices of this block's rows: (V, ...) -> (N, ...)."""
         return values if self.rows is None else take(values, self.rows)
 
     def neighbours(self, values: AnyArray) -> AnyArray:
@@ -67,8 +72,8 @@ class Table(eqx.Module):
     """Neighbours of every vertex: the bulk block, then tail blocks that replace the rows too long for it.
 
     Attributes:
-        blocks: the bulk, then the tail.
-        reverse: who uses each vertex; without it transposed sums scatter.
+        blocks: the bulk block, then the tail blocks.
+        reverse: the rows that use each vertex; None if transposed sums scatter.
     """
 
     blocks: tuple[Block, ...]
@@ -81,7 +86,7 @@ class Table(eqx.Module):
 
     @property
     def num_slots(self) -> int:
-        """Number of slots held, empty ones included: what a weight per slot costs."""
+        """Number of slots including empty ones, which is the number of weights."""
         return sum(block.indices.size for block in self.blocks)
 
     def rows_from(self, values: list[AnyArray]) -> AnyArray:
@@ -98,11 +103,11 @@ class Table(eqx.Module):
         return out
 
     def map(self, function: Callable[..., AnyArray], *per_block) -> AnyArray:
-        """Apply ``function(block, *arguments of that block) -> (N, ...)`` to every block and put the rows together."""
+        """Apply ``function(block, *arguments_of_block) -> (N, ...)`` to every block and combine the rows to (V, ...)."""
         return self.rows_from(self._apply(function, per_block, axis=0))
 
     def each(self, function: Callable[..., Any], *per_block) -> list[Any]:
-        """Apply a function to every block; what it returns, arrays (..., N) in any nest, comes back one for each."""
+        """The results of a function for every block, as a list; each is a pytree of arrays (..., N)."""
         return self._apply(function, per_block, axis=-1)
 
     def _apply(self, function, per_block, axis):
@@ -117,9 +122,9 @@ class Reverse(eqx.Module):
     """A table read backwards.
 
     Attributes:
-        users: for every vertex, the rows in which it is a neighbour.
-        positions: for each block of ``users``, which slot of the table that is: a position in the table's slots laid
-            end to end, block after block; their number, where a slot of ``users`` is empty.
+        users: for every vertex, the rows that use it.
+        positions: for each block of ``users``, the positions of the corresponding slots in the concatenation of all slots
+            of the table, block after block. An empty slot of ``users`` holds the total number of slots.
     """
 
     users: Table
@@ -131,7 +136,7 @@ class ReverseWeights(eqx.Module):
 
     Attributes:
         slots: one array (K, N) for each block of ``reverse.users``.
-        imbalance: (V,) the sum of what others' rows weigh each vertex with, less the sum of its own row.
+        imbalance: (V,) the sum of the weights that other rows give to each vertex, minus the sum of its own row.
     """
 
     slots: tuple[AnyArray, ...]
@@ -139,9 +144,9 @@ class ReverseWeights(eqx.Module):
 
 
 def _pieces(block: Block, arguments: list[Any]):
-    """A block and what belongs to it, arrays (..., N) in any nest; on the host a few thousand rows at a time.
+    """A block and its arguments, pytrees of arrays (..., N); on the host in pieces of a few thousand rows.
 
-    Intermediate arrays are many times the size of the block: in pieces they stay in the cache.
+    Intermediate arrays are many times the size of the block, and in pieces they fit into the processor's cache.
     """
     count = block.indices.shape[1]
     if not isinstance(block.indices, np.ndarray) or count <= _PIECE:
@@ -150,22 +155,22 @@ def _pieces(block: Block, arguments: list[Any]):
     for start in range(0, count, _PIECE):
         stop = min(start + _PIECE, count)
         rows = np.arange(start, stop, dtype=np.int32) if block.rows is None else block.rows[start:stop]
-        here = Block(block.indices[:, start:stop], rows)
-        yield here, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
+        piece = Block(block.indices[:, start:stop], rows)
+        yield piece, *jax.tree.map(lambda values: values[..., start:stop], arguments)  # noqa: B023
 
 
-# Tail blocks are joined as long as the slots this adds, over all joins, are at most this share of the bulk's.
+# Tail blocks are joined while the slots added by all joins are at most this share of the slots of the bulk.
 _FEWER_BLOCKS = 0.05
 
 
 def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
-    """The table of rows given as ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
+    """The table with the rows ``neighbours[offsets[v]:offsets[v + 1]]``, in NumPy.
 
-    At most 1.05 V K + 2 L slots are held, where L is the sum of the lengths of the rows longer than K. K is the width
-    for which V K + 2 L is least.
+    It has at most 1.05 V K + 2 L slots, where L is the total length of the rows longer than K, and K is the width that
+    minimises V K + 2 L.
 
     Args:
-        offsets: (V + 1,) integers.
+        offsets: (V + 1,) the start of each row.
         neighbours: (sum of lengths,) vertex indices.
     """
     lengths = np.diff(offsets)
@@ -173,7 +178,7 @@ def build_table(offsets: np.ndarray, neighbours: np.ndarray) -> Table:
 
 
 def weighted_table(matrix: scipy.sparse.csr_array) -> tuple[Table, tuple[np.ndarray, ...]]:
-    """The entries of a square sparse matrix off its diagonal, as a table and its weights (host)."""
+    """The off-diagonal entries of a square sparse matrix, as a table and its weights (host)."""
     entries: Any = scipy.sparse.coo_array(matrix)
     is_off = (entries.row != entries.col) & (entries.data != 0)
     rows, columns, values = entries.row[is_off], entries.col[is_off], entries.data[is_off]
@@ -184,7 +189,7 @@ def weighted_table(matrix: scipy.sparse.csr_array) -> tuple[Table, tuple[np.ndar
 
 
 def slot_values(offsets: np.ndarray, values: np.ndarray, empty: float | int) -> tuple[np.ndarray, ...]:
-    """Values of the entries of rows in the layout of `build_table`: one array (K, N) per block (host).
+    """Values of entries in the layout of `build_table`: one array (K, N) per block (host).
 
     Args:
         offsets: (V + 1,) integers, as for `build_table`.
@@ -216,24 +221,24 @@ def reversible(table: Table) -> Table:
 
 
 def reverse_weights(table: Table, weights: tuple[AnyArray, ...]) -> ReverseWeights | None:
-    """The weights in the order of the table's reverse; None of a table without one.
+    """The weights in the order of the table's reverse; None if the table has no reverse.
 
-    In a loop that is differentiated in reverse they are wanted in every step: compute them once, before it.
+    The reverse pass of a loop needs them in every step, so compute them once before the loop.
     """
     if table.reverse is None:
         return None
     xp = weights[0].__array_namespace__()
-    none = xp.zeros(1, dtype=weights[0].dtype)
-    flat = xp.concatenate([*(block.reshape(-1) for block in weights), none])
+    zero = xp.zeros(1, dtype=weights[0].dtype)
+    flat = xp.concatenate([*(block.reshape(-1) for block in weights), zero])
     slots = tuple(take(flat, positions) for positions in table.reverse.positions)
     own = xp.arange(table.num_vertices, dtype=np.int32)
-    # Weights of the surface are zero in empty slots, but derivatives with respect to them need not be.
+    # Weights of a surface are zero in empty slots, but tangents and cotangents of weights need not be.
     used = table.map(lambda block, w: xp.where(block.indices == block.centre(own)[None], 0, w).sum(axis=0), weights)
     return ReverseWeights(slots, slot_sum(table.reverse.users, slots) - used)
 
 
 def _bulk_width(lengths: np.ndarray) -> int:
-    """The K for which V * K plus twice the lengths of rows longer than K is least."""
+    """The width K that minimises V * K plus twice the total length of the rows longer than K."""
     counts = np.bincount(lengths, minlength=2)
     widths = np.arange(len(counts))
     longer = (counts * widths).sum() - np.cumsum(counts * widths)
@@ -241,7 +246,7 @@ def _bulk_width(lengths: np.ndarray) -> int:
 
 
 def _division(lengths: np.ndarray):
-    """The rows of every block and its width; the bulk has all rows, which is written None."""
+    """The rows and the width of every block; the rows of the bulk are all rows, written as None."""
     width = _bulk_width(lengths)
     yield None, width
     spare, rows = _FEWER_BLOCKS * width * len(lengths), np.zeros(0, np.int64)
@@ -250,7 +255,7 @@ def _division(lengths: np.ndarray):
         width *= 2
         wider = lengths[(lengths > width) & (lengths <= 2 * width)]
         widest = int(lengths[rows].max(initial=0))
-        # Small tail blocks join the next wider one: every block adds about a second to the compile time of a program.
+        # Every block adds about a second to the compile time of a program, so small tail blocks join the next wider one.
         added = (int(wider.max(initial=0)) - widest) * len(rows)
         if len(wider) and added <= spare:
             spare -= added
@@ -260,15 +265,15 @@ def _division(lengths: np.ndarray):
 
 
 def _laid_out(part, offsets, values, lengths, empty=None) -> Block:
-    """A block of the values of rows; an empty slot holds the row's own index, or ``empty``."""
+    """A block of integer values; an empty slot holds ``empty``, by default the row's own index."""
     rows, _ = part
     empty = (np.arange(len(lengths)) if rows is None else rows) if empty is None else empty
-    held = _slots(part, offsets, values, lengths, empty)
-    return Block(held.astype(np.int32), None if rows is None else rows.astype(np.int32))
+    slots = _slots(part, offsets, values, lengths, empty)
+    return Block(slots.astype(np.int32), None if rows is None else rows.astype(np.int32))
 
 
 def _slots(part, offsets, values, lengths, empty) -> np.ndarray:
-    """The values of rows in the slots of a block, (K, N)."""
+    """The values in the slots of a block, (K, N)."""
     rows, width = part
     own = np.arange(len(lengths)) if rows is None else rows
     slot = np.arange(width)[:, None]
@@ -283,7 +288,7 @@ def slot_sum(table: Table, weights: tuple[AnyArray, ...]) -> AnyArray:
 
 
 def coordinates(table: Table, weights: tuple[AnyArray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns and values of the used slots (host), for a sparse matrix of the sum over neighbours."""
+    """Rows, columns and values of the used slots, as in a sparse matrix of the sum over neighbours (host)."""
     rows, columns, values = [], [], []
     for block, weight in zip(table.blocks, weights, strict=True):
         index, value = jax.device_get((block.indices, weight))
