@@ -60,9 +60,9 @@ class Polynomial:
 
     Degree 4 pays off if normals turn by less than a radian over the neighbours of a fit. For Poisson's equation on a
     jittered torus with radii 2 and 1, its error equals that of `Monotone` at 800 vertices, is 0.4 of it at 1,600 and a
-    tenth at 6,300; on a torus with bumps it is 1.6 times that of `Monotone` even at 6,300. A `CoarseMeshWarning` reports
-    coarser meshes. Degree 3 has twice the error of `Monotone` there at every size: it is meant for gradients and
-    curvature.
+    tenth at 6,300; on a torus with bumps it is 1.6 times that of `Monotone` even at 6,300. A `CoarseMeshWarning`
+    reports coarser meshes. Degree 3 has twice the error of `Monotone` there at every size: it is meant for gradients
+    and curvature.
 
     A fit that would cross a crease is made in the intrinsic chart of the vertex, which is exact if both sides are flat
     and first order if they are curved. Weights have both signs, so there is no maximum principle, and on bad meshes the

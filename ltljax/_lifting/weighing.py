@@ -42,8 +42,8 @@ class Topology(eqx.Module):
         jet_paths: for each block of ``jet``, the half-edges that lead to its neighbours; None if all rows are laid out
             in space.
         diffusion_paths: the same for ``diffusion``.
-        cotangent_rows: for each block of ``diffusion``, its rows that are rows of the cotangent Laplacian; None if there
-            are none.
+        cotangent_rows: for each block of ``diffusion``, its rows that are rows of the cotangent Laplacian; None if
+            there are none.
         triangulation: the intrinsic Delaunay triangulation; None if all rows are laid out in space.
         is_extrinsic: (V,) whether the row of a vertex is laid out in space; None if all rows are laid out alike.
         is_creased: (V,) whether the neighbours of a vertex lie across a crease, so that no height fit is made there;
@@ -294,7 +294,7 @@ def _jet_rows(
 
 
 def _height(vertices, normals, topology: Topology, block, weights):
-    """The jet of the surface's height over the tangent plane of each row of a block; zero for rows laid out in charts."""
+    """The jet of the height over the tangent plane of each row of a block; zero for rows laid out in charts."""
     height = jets.height_jet(offsets(vertices, block), block.centre(normals), weights)
     if topology.triangulation is None:
         return height
@@ -362,7 +362,7 @@ def conormals_in_frame(
     conormals: Float[AnyArray, "B 2 3"],
     directions: Directions | None,
 ) -> Float[AnyArray, "B 2 2"]:
-    """The conormals (B, 2, 2) of both sides of each boundary vertex, in the coordinates in which its row is laid out."""
+    """The conormals (B, 2, 2) of both sides of each boundary vertex, in the coordinates of its row."""
     xp = frames.__array_namespace__()
     in_space = xp.einsum("bsc,bac->bsa", conormals, frames[topology.boundary])
     if directions is None:
@@ -388,8 +388,9 @@ def _side_lengths(vertices, topology: Topology):
 def flux_weights(first_moments: Float[AnyArray, "B 2"], conormals: Float[AnyArray, "B 2 2"]) -> Float[AnyArray, "B 2"]:
     """The weights (B, 2) of the fluxes through both sides of each boundary vertex.
 
-    A boundary row has the error ``first_moments . grad u``, which the fluxes cancel. On a smooth boundary the tangential
-    part of the gradient has no weight; at a corner the gradient g solves ``conormal . g = flux`` for both sides.
+    A boundary row has the error ``first_moments . grad u``, which the fluxes cancel. On a smooth boundary the
+    tangential part of the gradient has no weight; at a corner the gradient g solves ``conormal . g = flux`` for both
+    sides.
 
     Args:
         first_moments: (B, 2) the first moments of the rows.

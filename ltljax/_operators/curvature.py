@@ -39,13 +39,13 @@ class Curvature(eqx.Module):
 def curvature(surface: Surface) -> Curvature:
     """The curvature of a smooth surface, from the second derivatives of its height over each tangent plane.
 
-    ``Monotone`` is first order on irregular meshes, ``Polynomial`` has order degree - 1. ``Monotone`` fits in the tangent
-    plane with chord lengths under every lift, and is nearly exact on spheres. The fits are computed in float64 on the
-    host, once per surface. While a JAX transformation is tracing the surface they are computed in the widest float type
-    that is switched on; in float32 they lose their accuracy at vertices whose edge lengths differ by a factor of more
-    than three hundred. The result is differentiable in the vertices, except for the principal directions where both
-    curvatures are equal. At a crease or a corner the curvature is a measure and not a function, and the fitted values
-    grow as the mesh is refined: use `polyhedral_curvature` there, or if the integral must be exact.
+    ``Monotone`` is first order on irregular meshes, ``Polynomial`` has order degree - 1. ``Monotone`` fits in the
+    tangent plane with chord lengths under every lift, and is nearly exact on spheres. The fits are computed in float64
+    on the host, once per surface. While a JAX transformation is tracing the surface they are computed in the widest
+    float type that is switched on; in float32 they lose their accuracy at vertices whose edge lengths differ by a
+    factor of more than three hundred. The result is differentiable in the vertices, except for the principal directions
+    where both curvatures are equal. At a crease or a corner the curvature is a measure and not a function, and the
+    fitted values grow as the mesh is refined: use `polyhedral_curvature` there, or if the integral must be exact.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -122,8 +122,8 @@ class PolyhedralCurvature(eqx.Module):
             the surface is convex, and 1 / R on a sphere of radius R.
         crease_mean: (V,) the part of ``mean`` that comes from creases, edges with a dihedral angle of more than 40
             degrees. This part grows as the mesh is refined; the remainder converges.
-        turning: (V,) the angle pi - T by which the boundary turns at a vertex, zero in the interior. It is an angle, not
-            a density.
+        turning: (V,) the angle pi - T by which the boundary turns at a vertex, zero in the interior. It is an angle,
+            not a density.
     """
 
     gauss: Float[Array, " V"]

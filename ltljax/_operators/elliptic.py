@@ -42,8 +42,8 @@ class EllipticStencil(Stencil):
     Attributes:
         paths: for each block of the table, the half-edges that lead to its neighbours; None if all rows are laid out in
             space.
-        cotangent_rows: for each block, the rows that are half the trace of D times a row of the cotangent Laplacian; None
-            if there are none.
+        cotangent_rows: for each block, the rows that are half the trace of D times a row of the cotangent Laplacian;
+            None if there are none.
         residual: (V,) the largest relative error of a moment of each row, zero up to rounding if the row is consistent.
         flux_weights: (B, 2) the change of the operator per unit flux through each side of a boundary vertex.
         mean_diffusion: half the trace of D in the tangent plane, averaged over the vertices.
@@ -61,8 +61,8 @@ class EllipticStencil(Stencil):
         """How far the eigenvalues lie from the real axis, as in `ltl.operators.spectral_width`; without derivatives.
 
         It is an estimate, at most the spectral bound, which always suffices. The part that comes from rows that are not
-        symmetric is measured when the stencil is built, and estimated from the row sums for other coefficients; the part
-        that comes from the drift is the largest value of b . D^-1 b.
+        symmetric is measured when the stencil is built, and estimated from the row sums for other coefficients; the
+        part that comes from the drift is the largest value of b . D^-1 b.
         """
         return jnp.asarray(self.width)
 
@@ -109,12 +109,13 @@ def elliptic_stencil(
 ) -> EllipticStencil:
     """Non-negative weights for the operator D : Hess u + b . grad u, or div(D grad u) + b . grad u (host).
 
-    A row uses the one-ring if its weights are non-negative, and otherwise the neighbours that non-negative least squares
-    selects from two or three rings. The operator is pointwise first order, like the Laplacian. If drift dominates
-    (|b| h > 2 D), no non-negative row meets both; then the row is upwind: it meets the drift and adds as little diffusion
-    as possible, of the order |b| h. If D is so anisotropic that three rings contain no consistent row, the row of least
-    error is used. Both cases show in the residual. The operator has a maximum principle and no growing modes. On a
-    boundary the normal derivative is assumed to vanish; equations add the fluxes of `Neumann` and `Robin` conditions.
+    A row uses the one-ring if its weights are non-negative, and otherwise the neighbours that non-negative least
+    squares selects from two or three rings. The operator is pointwise first order, like the Laplacian. If drift
+    dominates (|b| h > 2 D), no non-negative row meets both; then the row is upwind: it meets the drift and adds as
+    little diffusion as possible, of the order |b| h. If D is so anisotropic that three rings contain no consistent row,
+    the row of least error is used. Both cases show in the residual. The operator has a maximum principle and no growing
+    modes. On a boundary the normal derivative is assumed to vanish; equations add the fluxes of `Neumann` and `Robin`
+    conditions.
 
     An isotropic operator without drift uses D times the cotangent row wherever the Laplacian has a cotangent row (see
     `SurfaceReport`). Other operators have no such rows; if no row is consistent, the residual shows it.
@@ -124,7 +125,8 @@ def elliptic_stencil(
 
     Args:
         surface: the surface.
-        diffusion: D, a number, (V,), or symmetric non-negative tensors (V, 3, 3), of which only the tangent part matters.
+        diffusion: D, a number, (V,), or symmetric non-negative tensors (V, 3, 3), of which only the tangent part
+            matters.
         drift: b, (V, 3), of which only the tangent part matters.
         progress: whether to show the progress of the choice of neighbours.
         divergence_form: whether the operator is div(D grad u) + b . grad u.
@@ -198,7 +200,7 @@ def _choose_rows(
 def direction_tensor(
     surface: Surface, direction: Float[AnyArray, "V 3"], along: float | AnyArray, across: float | AnyArray
 ) -> Float[Array, "V 3 3"]:
-    """A diffusion tensor for `elliptic_stencil` with the diffusivity ``along`` in a direction and ``across`` normal to it.
+    """A diffusion tensor for `elliptic_stencil`: diffusivity ``along`` in a direction and ``across`` normal to it.
 
     Only the tangent part of the direction matters, not its length or sign. Where that part vanishes the tensor is
     isotropic with the mean of both values. Principal directions of curvature give stripes that follow the shape.

@@ -121,8 +121,8 @@ def boundary_flux_weights(
 ) -> AnyArray:
     """The change of the operator per unit flux through both sides of each boundary vertex, (B, 2).
 
-    It follows from the excess of the first moments; for a row that is a multiple of the Laplacian's it is that multiple of
-    the Laplacian's flux weights.
+    It follows from the excess of the first moments; for a row that is a multiple of the Laplacian's it is that multiple
+    of the Laplacian's flux weights.
     """
     conormals = conormals_in_frame(topology, geometry.frames, geometry.conormals, geometry.directions)
     weights = flux_weights(excess[topology.boundary], conormals)

@@ -61,8 +61,8 @@ def spectral_width(surface: Surface) -> Float[Array, ""]:
     """How far the Laplacian's eigenvalues lie from the real axis.
 
     The width is a number chi, per unit time at diffusivity 1, such that each eigenvalue of negative real part satisfies
-    ``|Im|^2 <= chi |Re|``. Rows of the Laplacian are not symmetric on irregular meshes. Explicit steps of length dt must
-    be stable inside this parabola, so their number of stages depends on ``dt * chi`` too.
+    ``|Im|^2 <= chi |Re|``. Rows of the Laplacian are not symmetric on irregular meshes. Explicit steps of length dt
+    must be stable inside this parabola, so their number of stages depends on ``dt * chi`` too.
 
     The width is an estimate and not a bound. It is measured once per surface by Arnoldi iteration (host), whose first
     eigenvalues are those at the rim of the spectrum, and multiplied by 1.5. On a surface of more than 250,000 vertices,

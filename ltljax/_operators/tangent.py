@@ -220,9 +220,9 @@ def _hodge_laplacian(surface: Surface, gauss: Array, X: AnyArray) -> Array:
 def tensor_laplacian(surface: Surface, T: Float[AnyArray, "V *S 3 3"]) -> Float[Array, "V *S 3 3"]:
     """The Laplacian of a field of symmetric tangent tensors, such as Hessians or structure tensors.
 
-    A symmetric tensor is its trace, which is a scalar, plus a trace-free part, which is a line field with a magnitude and
-    is transported with symmetry 2. With ``Monotone`` both diffuse with non-negative weights, so the largest eigenvalue
-    cannot grow and the smallest cannot fall.
+    A symmetric tensor is its trace, which is a scalar, plus a trace-free part, which is a line field with a magnitude
+    and is transported with symmetry 2. With ``Monotone`` both diffuse with non-negative weights, so the largest
+    eigenvalue cannot grow and the smallest cannot fall.
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
@@ -258,7 +258,7 @@ def lie_derivative(surface: Surface, X: Float[AnyArray, "V 3"], u: Float[AnyArra
 
 @on_device
 def lie_bracket(surface: Surface, X: Float[AnyArray, "V 3"], Y: Float[AnyArray, "V 3"]) -> Float[Array, "V 3"]:
-    """The Lie bracket [X, Y], which is zero where the flows of X and Y commute: Y's derivative along X minus X's along Y."""
+    """The Lie bracket [X, Y], the derivative of Y along X minus that of X along Y; zero where their flows commute."""
     _check_one(surface, X)
     _check_one(surface, Y)
     along = jnp.einsum("vcd,vd->vc", covariant_derivative(surface, Y), X)
@@ -314,8 +314,8 @@ def singularities(surface: Surface, X: Float[AnyArray, "V 3"], symmetry: int = 1
     """The index of a field in every face: the number of counter-clockwise turns around the face, zero in most faces.
 
     Indices are multiples of 1 / symmetry. On a closed surface they sum to the Euler characteristic for every field
-    (Poincare and Hopf), so every field on a sphere has a singularity. Fields at neighbouring vertices are compared by the
-    shortest rotation between the normals.
+    (Poincare and Hopf), so every field on a sphere has a singularity. Fields at neighbouring vertices are compared by
+    the shortest rotation between the normals.
 
     Args:
         surface: the surface.
@@ -379,7 +379,7 @@ def check_tangent(surface: Surface, X: AnyArray) -> None:
 
 
 def _rotation(normal: AnyArray, frame: AnyArray, from_normal: AnyArray, from_frame: AnyArray) -> Array:
-    """The rotation (..., 2), as cosine and sine, from components in one frame to components in another after transport."""
+    """The rotation (..., 2), as cosine and sine, from components in one frame to another after transport."""
     moved = transport(from_normal, normal, from_frame[..., 0, :])
     return jnp.einsum("...ac,...c->...a", frame, moved)
 

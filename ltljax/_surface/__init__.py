@@ -1,7 +1,7 @@
 """The surface: the pytree, and how a mesh becomes one.
 
-What enters: a checked `Mesh` and a scheme. What leaves: a `Surface`, whose tables were chosen once on the host and whose
-weights are pure functions of the positions.
+What enters: a checked `Mesh` and a scheme. What leaves: a `Surface`, whose tables were chosen once on the host and
+whose weights are pure functions of the positions.
 """
 
 from .building import FarFromOriginWarning

@@ -192,8 +192,8 @@ def _lay_charts(
 ) -> tuple[Topology, _Chart | None]:
     """The topology with its intrinsic triangulation, and the charts; or no charts if all rows are laid out in space.
 
-    The intrinsic `Monotone` lays out all rows in charts except those at folded faces; `Polynomial` lays out only the rows
-    at creases in charts.
+    The intrinsic `Monotone` lays out all rows in charts except those at folded faces; `Polynomial` lays out only the
+    rows at creases in charts.
     """
     if on_crease is None or (isinstance(scheme, Polynomial) and not on_crease.any()):
         return topology, None

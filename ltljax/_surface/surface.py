@@ -55,7 +55,8 @@ class Surface(eqx.Module):
             mesh: the mesh.
             scheme: `Monotone()` (the default), `Polynomial()` or `Paper()`.
             dtype: float32 or float64; JAX's default float by default.
-            progress: whether to show the progress of the choice of neighbours, which takes seconds for 100,000 vertices.
+            progress: whether to show the progress of the choice of neighbours, which takes seconds for 100,000
+                vertices.
             differentiable: whether to keep the tables with which reverse-mode derivatives gather. Without them such
                 derivatives scatter and take several times longer; the surface is about a tenth smaller.
 
@@ -65,7 +66,8 @@ class Surface(eqx.Module):
                 mesh is so small or large that its weights leave the range of the dtype.
 
         Warns:
-            InconsistentRowsWarning: at some vertices `Monotone` has neither a consistent non-negative row nor a cotangent
+            InconsistentRowsWarning: at some vertices `Monotone` has neither a consistent non-negative row nor a
+            cotangent
                 row, or no choice of neighbours determines the fit of `Polynomial`.
             CoarseMeshWarning: `Polynomial` is less accurate than `Monotone` on so coarse a mesh.
             FarFromOriginWarning: positions are relative to ``surface.centre``.
@@ -83,7 +85,8 @@ class Surface(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write the surface to a file with all its tables and weights, replacing an existing file.
 
-        The file is an NPZ archive of arrays and contains no code. Loading is far faster than building the surface again.
+        The file is an NPZ archive of arrays and contains no code. Loading is far faster than building the surface
+        again.
 
         Args:
             path: the path of the file, usually ending in ``.npz``.
@@ -119,9 +122,9 @@ class Surface(eqx.Module):
     def with_vertices(self, vertices: Float[AnyArray, "V 3"]) -> "Surface":
         """The surface with moved vertices: every weight is recomputed for the same neighbours.
 
-        A pure, compiled function, differentiable in the vertices, without work on the host. The neighbours and the flips
-        of the intrinsic triangulation are those chosen for the original mesh: after a large deformation, build a new
-        surface. In float32, rows whose edge lengths differ by a factor of more than a thousand lose their accuracy.
+        A pure, compiled function, differentiable in the vertices, without work on the host. The neighbours and the
+        flips of the intrinsic triangulation are those chosen for the original mesh: after a large deformation, build a
+        new surface. In float32, rows whose edge lengths differ by a factor of more than a thousand lose their accuracy.
 
         Args:
             vertices: (V, 3) the new positions, relative to ``surface.centre``.
@@ -135,8 +138,8 @@ class Surface(eqx.Module):
         is_known = not isinstance(vertices, Tracer) and not self.is_traced
         if is_known and self.centre.any() and (middle := far_middle(np.asarray(vertices))).any():
             raise ValueError(
-                f"Expected positions relative to surface.centre, found positions around {as_text(middle)}. Subtract the "
-                "centre in double precision, or build a new surface from a mesh."
+                f"Expected positions relative to surface.centre, found positions around {as_text(middle)}. "
+                "Subtract the centre in double precision, or build a new surface from a mesh."
             )
         # Compute in the widest float type that is switched on, and cast last.
         vertices = jnp.asarray(vertices, float_dtype(None))

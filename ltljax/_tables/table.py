@@ -103,7 +103,7 @@ class Table(eqx.Module):
         return out
 
     def map(self, function: Callable[..., AnyArray], *per_block) -> AnyArray:
-        """Apply ``function(block, *arguments_of_block) -> (N, ...)`` to every block and combine the rows to (V, ...)."""
+        """Apply ``function(block, *arguments_of_block) -> (N, ...)`` to every block and combine the rows."""
         return self.rows_from(self._apply(function, per_block, axis=0))
 
     def each(self, function: Callable[..., Any], *per_block) -> list[Any]:
@@ -123,8 +123,8 @@ class Reverse(eqx.Module):
 
     Attributes:
         users: for every vertex, the rows that use it.
-        positions: for each block of ``users``, the positions of the corresponding slots in the concatenation of all slots
-            of the table, block after block. An empty slot of ``users`` holds the total number of slots.
+        positions: for each block of ``users``, the positions of the corresponding slots in the concatenation of all
+            slots of the table, block after block. An empty slot of ``users`` holds the total number of slots.
     """
 
     users: Table
@@ -255,7 +255,8 @@ def _division(lengths: np.ndarray):
         width *= 2
         wider = lengths[(lengths > width) & (lengths <= 2 * width)]
         widest = int(lengths[rows].max(initial=0))
-        # Every block adds about a second to the compile time of a program, so small tail blocks join the next wider one.
+        # Every block adds about a second to the compile time of a program, so small tail blocks join the next wider
+        # one.
         added = (int(wider.max(initial=0)) - widest) * len(rows)
         if len(wider) and added <= spare:
             spare -= added
