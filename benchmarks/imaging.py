@@ -449,7 +449,7 @@ def smoothers(mesh):
         return lambda s: function(surface, s * h**power, **options)
 
     def followed(s):
-        return imaging.denoise_mesh(surface, s[0], normal_iterations=s[1])
+        return imaging.filter_normals(surface, s[0], normal_iterations=s[1])
 
     def by_trimesh(filtered, **options):
         def run(iterations):
@@ -470,7 +470,7 @@ def smoothers(mesh):
 
     flows, fairs = imaging.mean_curvature_flow, imaging.fair
     alike = [(0.35, 5), *((s, n) for s in (0.25, 0.3, 0.4, 0.5) for n in (2, 5, 20, 50))]
-    yield "ltljax.denoise_mesh", followed, alike, True
+    yield "ltljax.filter_normals", followed, alike, True
     for kept, keep_volume in (("", False), (", volume kept", True)):
         yield f"ltljax.mean_curvature_flow{kept}", ours(flows, 2, steps=8, keep_volume=keep_volume), times, False
         yield f"ltljax.fair{kept}", ours(fairs, 2, keep_volume=keep_volume), times, False

@@ -49,7 +49,7 @@ def drawn(vertices, faces, values=None, limits=None, colormap="magma", view=VIEW
 
 
 def painted():
-    """Spot with a cartoon on it and a tenth of its range as noise, and what is left without."""
+    """A noisy cartoon on Spot, and the denoised one."""
     mesh = ltl.load_mesh(MESHES / "spot.obj")
     surface = ltl.Surface.from_mesh(mesh)
     x, y, z = surface.vertices.T
@@ -99,7 +99,7 @@ def scan():
     edge = np.linalg.norm(mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)], axis=-1).mean()
     noise = 0.25 * edge * np.random.default_rng(0).normal(size=(mesh.num_vertices, 3))
     surface = ltl.Surface.from_mesh(ltl.Mesh(mesh.vertices + noise, mesh.faces))
-    found = ltl.imaging.denoise_mesh(surface)
+    found = ltl.imaging.filter_normals(surface)
     rounded = ltl.imaging.mean_curvature_flow(surface, 0.6 * edge**2, keep_volume=True)
     return [drawn(vertices, mesh.faces, smooth=False) for vertices in (surface.vertices, found, rounded)]
 

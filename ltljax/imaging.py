@@ -1,7 +1,7 @@
-"""Processing of images and shapes on surfaces, and pictures of vector fields.
+"""Image processing, mesh processing and flow visualisation on surfaces.
 
-Images: denoising, inpainting, segmentation. Shapes: fairing, denoising, ridges. Fields: streamlines and line integral
-convolution.
+Images: denoising, diffusion, inpainting, segmentation. Meshes: fairing, mean curvature flow, bilateral normal
+filtering, ridges. Vector fields: streamlines and line integral convolution.
 """
 
 from ._imaging.flow.lic import lic_picture, line_integral_convolution
@@ -15,16 +15,16 @@ from ._imaging.images.anisotropic import (
     edge_enhancing,
     structure_tensor,
 )
+from ._imaging.images.diffusion import PeronaMalik, diffuse, local_mean, perona_malik, sharpen, smoothed as smoothed
 from ._imaging.images.directions import denoise_chromaticity, diffuse_directions
 from ._imaging.images.inpainting import inpaint
 from ._imaging.images.quality import mse, psnr, ssim
 from ._imaging.images.segmentation import Segmentation, segment
-from ._imaging.images.smoothing import PeronaMalik, diffuse, perona_malik, sharpen, smoothed
 from ._imaging.images.textures import from_texture, project_image, to_texture
 from ._imaging.images.variation import denoise, noise_strength
 from ._imaging.shapes.fairing import fair, mean_curvature_flow
+from ._imaging.shapes.normal_filter import denoise_mesh as denoise_mesh, filter_normals
 from ._imaging.shapes.relief import Ridges, ridges, shape_index
-from ._imaging.shapes.scans import denoise_mesh
 from ._imaging.shapes.volume import enclosed_volume
 from ._show import displaced
 
@@ -39,7 +39,6 @@ __all__ = [
     "coherence_enhancing",
     "denoise",
     "denoise_chromaticity",
-    "denoise_mesh",
     "diffuse",
     "diffuse_directions",
     "diffusion_tensor",
@@ -47,10 +46,12 @@ __all__ = [
     "edge_enhancing",
     "enclosed_volume",
     "fair",
+    "filter_normals",
     "from_texture",
     "inpaint",
     "lic_picture",
     "line_integral_convolution",
+    "local_mean",
     "mean_curvature_flow",
     "mse",
     "noise_strength",
@@ -61,7 +62,6 @@ __all__ = [
     "segment",
     "shape_index",
     "sharpen",
-    "smoothed",
     "solid_noise",
     "ssim",
     "streamlines",

@@ -1,4 +1,8 @@
-"""What is solved: equations as small pytrees of parameters. `solve` asks them for their rate of change."""
+"""Equations: small pytrees of parameters that `solve` asks for their rate of change.
+
+What enters: diffusivities, reactions, sources and boundary conditions. What leaves: the rate u_t of a state on a
+surface, and bounds of the eigenvalues of its derivative.
+"""
 
 from . import kinetics
 from .boundary import Dirichlet, Neumann, Robin

@@ -1,7 +1,8 @@
-"""What holds on the boundary of a surface: conditions as values, and what they do to a diffusion.
+"""Boundary conditions as values, and their effect on diffusion.
 
-What enters: conditions, the time and the state. What leaves: the fluxes they let through, and the values they hold.
-Where nothing is said the normal derivative vanishes. Of two conditions for the same vertex the later one holds.
+What enters: conditions, the time and the state. What leaves: boundary fluxes, and the state with the values that
+conditions hold. Where no condition applies the normal derivative vanishes. If two conditions apply to the same vertex,
+the later one wins.
 """
 
 import functools
@@ -18,34 +19,32 @@ from jaxtyping import Array, Bool, Float
 from .._operators import add_flux, laplacian, through_sides
 from .._surface import Surface
 
-# None for the whole boundary, the number of a boundary loop (as in mesh.boundary_loops), a mask (V,), or a predicate
+# None for the whole boundary, the index of a boundary loop in mesh.boundary_loops, a mask (V,), or a predicate
 # ``vertices (V, 3) -> (V,)``.
 Where = None | int | Bool[Array, " V"] | Callable[[Float[Array, "V 3"]], Bool[Array, " V"]]
-# None for all species of a state (V, S), the number of one, or several of them.
+# None for all species of a state (V, S), the index of a species, or several indices.
 Species = None | int | tuple[int, ...]
 # A number, an array that fits the state, or a function ``(t, vertices) -> array``.
 Data = Any
 
 
-def _species(given: Species) -> Species:
-    if given is None:
+def _species(species: Species) -> Species:
+    if species is None:
         return None
-    return (
-        tuple(operator.index(species) for species in given)
-        if isinstance(given, tuple | list)
-        else operator.index(given)
-    )
+    if isinstance(species, tuple | list):
+        return tuple(operator.index(index) for index in species)
+    return operator.index(species)
 
 
 class Neumann(eqx.Module):
-    """du/dnu = flux on the boundary, nu the outward conormal.
+    """du/dnu = flux on the boundary, where nu is the outward conormal.
 
     Attributes:
-        flux: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these; also the gradient whose
-            part along the conormal is meant, (V, 3) or (V, S, 3), which serves both sides of a corner.
-        where: None for the whole boundary, the number of a loop in ``mesh.boundary_loops``, a mask (V,), or a predicate
+        flux: a number, an array (V,), (S,) or (V, S), or a function ``(t, vertices)`` that returns one of these. Also a
+            gradient (V, 3) or (V, S, 3), whose component along the conormal is used; it fits both sides of a corner.
+        where: None for the whole boundary, the index of a loop in ``mesh.boundary_loops``, a mask (V,), or a predicate
             ``vertices (V, 3) -> (V,)``.
-        species: of a state (V, S) the number of the species that is meant, or several; None for all.
+        species: index of the species of a state (V, S) to which the condition applies, or several; None for all.
     """
 
     flux: Data = 0.0
@@ -54,12 +53,12 @@ class Neumann(eqx.Module):
 
 
 class Dirichlet(eqx.Module):
-    """u = value on the boundary; with a mask also at vertices inside.
+    """u = value on the boundary, or with a mask also at interior vertices.
 
     Attributes:
-        value: a number, (V,), (S,) or (V, S), or a function ``(t, vertices)`` of one of these.
-        where: as of `Neumann`.
-        species: as of `Neumann`.
+        value: a number, an array (V,), (S,) or (V, S), or a function ``(t, vertices)`` that returns one of these.
+        where: as in `Neumann`.
+        species: as in `Neumann`.
     """
 
     value: Data = 0.0
@@ -68,14 +67,14 @@ class Dirichlet(eqx.Module):
 
 
 class Robin(eqx.Module):
-    """a u + b du/dnu = g on the boundary, nu the outward conormal. Diffusion stays stable where a / b >= 0.
+    """a u + b du/dnu = g on the boundary, where nu is the outward conormal. Diffusion is stable if a / b >= 0.
 
     Attributes:
-        a: as the values of `Dirichlet`.
-        b: as the values of `Dirichlet`; not zero.
-        g: as the values of `Dirichlet`.
-        where: as of `Neumann`.
-        species: as of `Neumann`.
+        a: coefficient of u, in the forms that ``Dirichlet.value`` takes.
+        b: nonzero coefficient of du/dnu, in the same forms.
+        g: right-hand side, in the same forms.
+        where: as in `Neumann`.
+        species: as in `Neumann`.
     """
 
     a: Data = 1.0
@@ -90,7 +89,11 @@ Conditions = Condition | tuple[Condition, ...]
 
 
 def as_tuple(conditions: Conditions | list[Condition] | None) -> tuple[Condition, ...]:
-    """The conditions as a tuple."""
+    """The conditions as a tuple.
+
+    Raises:
+        TypeError: a value is not a boundary condition.
+    """
     if conditions is None:
         return ()
     conditions = tuple(conditions) if isinstance(conditions, tuple | list) else (conditions,)
@@ -103,7 +106,7 @@ def as_tuple(conditions: Conditions | list[Condition] | None) -> tuple[Condition
 def bounded_laplacian(
     surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "V *S"]:
-    """The Laplacian of a state that keeps the conditions, with the fluxes they let through."""
+    """The Laplacian of a state that satisfies the conditions, including their fluxes."""
     rate, flux = laplacian(surface, u), fluxes(surface, conditions, t, u)
     return rate if flux is None else add_flux(surface, rate, flux)
 
@@ -111,7 +114,7 @@ def bounded_laplacian(
 def fluxes(
     surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, "2 B *S"] | None:
-    """The normal derivatives of a state at both sides of the boundary vertices; None where none are prescribed."""
+    """The normal derivatives of a state at both sides of every boundary vertex; None if no condition prescribes any."""
     conditions = as_tuple(conditions)
     if not any(isinstance(condition, Neumann | Robin) for condition in conditions):
         return None
@@ -145,29 +148,29 @@ def held_rate(
     u: Float[Array, "V *S"],
     rate: Float[Array, "V *S"],
 ) -> Float[Array, "V *S"]:
-    """The rate of change, where Dirichlet conditions hold the state that of their values."""
+    """The rate of change, replaced at held vertices by the time derivative of the held values."""
     for condition in _dirichlet(conditions):
-        at = jnp.asarray(t, u.dtype)
-        _, change = jax.jvp(lambda s, c=condition: _data(c.value, s, surface, u), (at,), (jnp.ones_like(at),))
+        t = jnp.asarray(t, u.dtype)
+        _, change = jax.jvp(lambda t, c=condition: _data(c.value, t, surface, u), (t,), (jnp.ones_like(t),))
         rate = _where(condition, surface, change, rate)
     return rate
 
 
 def released(surface: Surface, conditions: Conditions, rate: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
-    """The rate of change, zero where Dirichlet conditions hold the state."""
+    """The rate of change, set to zero where Dirichlet conditions hold the state."""
     for condition in _dirichlet(conditions):
         rate = _where(condition, surface, jnp.zeros_like(rate), rate)
     return rate
 
 
 def held_values(surface: Surface, conditions: Conditions, u: Float[Array, "V *S"]) -> Bool[Array, "V *S"]:
-    """Which values of a state Dirichlet conditions hold."""
+    """The mask of the values of a state that Dirichlet conditions hold."""
     masks = [_covered(condition, surface, u) for condition in _dirichlet(conditions)]
     return functools.reduce(jnp.logical_or, masks, jnp.zeros(u.shape, bool))
 
 
 def held_vertices(surface: Surface, conditions: Conditions) -> Bool[Array, " V"]:
-    """The vertices at which Dirichlet conditions hold every species."""
+    """The mask of the vertices at which Dirichlet conditions hold every species."""
     masks = [_mask(condition.where, surface) for condition in _dirichlet(conditions) if condition.species is None]
     return functools.reduce(jnp.logical_or, masks, jnp.zeros(surface.num_vertices, bool))
 
@@ -175,7 +178,7 @@ def held_vertices(surface: Surface, conditions: Conditions) -> Bool[Array, " V"]
 def absorption(
     surface: Surface, conditions: Conditions, t: Float[Array, ""], u: Float[Array, "V *S"]
 ) -> Float[Array, " V"]:
-    """What Robin conditions take from -Delta u at each vertex, per unit of u; the mean over species."""
+    """The contribution of Robin conditions to -Delta u at each vertex, per unit of u and averaged over species."""
     linear = tuple(
         Robin(condition.a, condition.b, 0.0, condition.where, condition.species)
         if isinstance(condition, Robin)
@@ -183,8 +186,8 @@ def absorption(
         for condition in as_tuple(conditions)
         if not isinstance(condition, Dirichlet)
     )
-    taken = -bounded_laplacian(surface, linear, t, jnp.ones_like(u))
-    return jnp.mean(taken.reshape(surface.num_vertices, -1), axis=1)
+    absorbed = -bounded_laplacian(surface, linear, t, jnp.ones_like(u))
+    return jnp.mean(absorbed.reshape(surface.num_vertices, -1), axis=1)
 
 
 def stiffness(
@@ -194,8 +197,10 @@ def stiffness(
     u: Float[Array, "V *S"],
     weights: Float[Array, "B 2"] | None = None,
 ) -> Float[Array, ""]:
-    """A bound of what Robin conditions add to the eigenvalues of the Laplacian, or of an operator with flux weights of
-    its own."""
+    """A bound of the change of the Laplacian's eigenvalues by Robin conditions.
+
+    With ``weights``, of the eigenvalues of an operator that has these flux weights.
+    """
     bound = jnp.zeros((), u.dtype)
     for condition in as_tuple(conditions):
         if isinstance(condition, Robin):
@@ -215,13 +220,14 @@ def _where(condition: Condition, surface: Surface, inside: Array, outside: Array
 
 
 def _covered(condition: Condition, surface: Surface, u: Array) -> Bool[Array, "V *#S"]:
-    """Which values of a state a condition is for."""
+    """The mask of the values of a state to which a condition applies."""
     mask = _mask(condition.where, surface).reshape(-1, *(1,) * (u.ndim - 1))
     if condition.species is None:
         return mask
     if u.ndim != 2:
         raise ValueError(
-            f"A condition for species {condition.species} needs a state of several species, (V, S), found {u.shape}."
+            f"A condition for species {condition.species} needs a state of several species (V, S), found shape "
+            f"{u.shape}."
         )
     chosen = (condition.species,) if isinstance(condition.species, int) else condition.species
     if not all(0 <= species < u.shape[1] for species in chosen):
@@ -230,44 +236,49 @@ def _covered(condition: Condition, surface: Surface, u: Array) -> Bool[Array, "V
 
 
 def _mask(where: Where, surface: Surface) -> Bool[Array, " V"]:
-    """The vertices a condition is for."""
+    """The mask of the vertices to which a condition applies."""
     topology = surface.topology
     is_mask = not (where is None or isinstance(where, int) or callable(where))
     if topology.num_loops == 0 and not is_mask:
         raise ValueError(
-            "A boundary condition was given, but the surface is closed. Give a mask to hold values inside."
+            "Expected a surface with a boundary for a boundary condition, but the surface is closed. To hold values at "
+            "interior vertices, give a mask as `where`."
         )
     if isinstance(where, int) and not 0 <= where < topology.num_loops:
         raise ValueError(
-            f"Expected the number of a boundary loop below {topology.num_loops} (see mesh.boundary_loops), "
+            f"Expected the index of a boundary loop below {topology.num_loops} (see mesh.boundary_loops), "
             f"found {where}."
         )
     size = surface.num_vertices
-    everywhere = jnp.zeros(size, bool).at[topology.boundary].set(True)
+    on_boundary = jnp.zeros(size, bool).at[topology.boundary].set(True)
     if where is None:
-        return everywhere
+        return on_boundary
     if isinstance(where, int):
         return jnp.zeros(size, bool).at[topology.boundary].set(topology.loops == where)
     mask = where(surface.vertices) if callable(where) else jnp.asarray(where)
     if mask.shape != (size,) or mask.dtype != bool:
         raise ValueError(f"Expected `where` to give booleans of shape ({size},), found {mask.dtype} {mask.shape}.")
-    return mask & everywhere if callable(where) else mask
+    return mask & on_boundary if callable(where) else mask
 
 
 def _called(data: Callable, t: Any, surface: Surface) -> Any:
-    """What a function of time and place returns."""
+    """The value of a function ``(t, vertices)``.
+
+    Raises:
+        TypeError: the function takes other arguments.
+    """
     try:
         inspect.signature(data).bind(t, surface.vertices)
     except TypeError:
         raise TypeError(
-            "Expected data of a boundary condition as a number, an array or a function (t, vertices) -> array, found a "
-            f"function {inspect.signature(data)}."
+            "Expected boundary data as a number, an array or a function (t, vertices) -> array, found a function "
+            f"{inspect.signature(data)}."
         ) from None
     return data(t, surface.vertices)
 
 
 def _data(data: Data, t, surface: Surface, u: Array, *, may_be_gradient: bool = False) -> Array:
-    """The data of a condition at a time, in the shape of the state (or of its gradient)."""
+    """The data of a condition at time t, in the shape of the state or of its gradient."""
     values = jnp.asarray(_called(data, t, surface) if callable(data) else data, u.dtype)
     if may_be_gradient and values.shape == (*u.shape, 3):
         return values

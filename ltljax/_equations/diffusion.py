@@ -1,4 +1,4 @@
-"""Linear diffusion with a source, of one field or of several species that do not meet."""
+"""Linear diffusion with a source, for one field or several uncoupled species."""
 
 from collections.abc import Callable
 
@@ -19,13 +19,13 @@ class Diffusion(Equation):
     """u_t = D Delta u + g, or div(D grad u) + g where D varies, on a surface.
 
     Attributes:
-        diffusivity: D, a positive number; a field (V,) for div(D grad u), which may jump, and through a zero of which
-            nothing flows (`weighted_laplacian` with the harmonic mean); or an `EllipticStencil`, such as diffusion
-            along a direction field or drift with a flow. For a state (V, S) also one number for each species, (S,), or
-            a tuple with any of these for each.
+        diffusivity: D, in one of three forms. A positive number. A field (V,) for div(D grad u), which may jump; zeros
+            block the flux (`weighted_laplacian` with the harmonic mean). An `EllipticStencil`, such as diffusion along
+            a direction field or drift with a flow. For a state (V, S) also one number per species, (S,), or a tuple
+            with any of these forms for each species.
         source: g: None, an array like the state, or a function ``(t, vertices) -> array``.
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several, for all species or some; without any the normal
-            derivative vanishes.
+        boundary: boundary conditions: `Neumann`, `Dirichlet` or `Robin`, or a tuple of these, for all species or some.
+            By default the normal derivative vanishes.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 3.
     """
@@ -35,32 +35,32 @@ class Diffusion(Equation):
     boundary: Conditions = eqx.field(default=(), converter=bounds.as_tuple)
 
     def rate(self, t, surface: Surface, u):
-        """The time derivative D Delta u + g; of a value that is held, that value's."""
+        """The time derivative D Delta u + g; for values held by a boundary condition, their own time derivative."""
         return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
 
     def implicit_rate(self, t, surface: Surface, u):
-        """D Delta u with the fluxes through the boundary; of a value that is held, that value's rate."""
+        """D Delta u, including boundary fluxes; for held values, their own time derivative."""
         u = self.held(t, surface, u)
         spread = spread_rate(surface, self.diffusivity, self.boundary, t, u)
         return bounds.held_rate(surface, self.boundary, t, u, spread)
 
     def explicit_rate(self, t, surface: Surface, u):
-        """The source g; zero where a value is held."""
+        """The source g, zero at held values."""
         if self.source is None:
             return jnp.zeros_like(u)
         source = self.source(t, surface.vertices) if callable(self.source) else self.source
         source = jnp.asarray(source, u.dtype)
         if source.shape != u.shape:
-            raise ValueError(f"Expected a source of the shape of the state, {u.shape}, found {source.shape}.")
+            raise ValueError(f"Expected a source with the shape of the state, {u.shape}, found {source.shape}.")
         return bounds.released(surface, self.boundary, source)
 
     def diffusivities(self, u):
-        """D for every species; of what varies, the mean."""
+        """D for every species, averaged if it varies over the surface."""
         return mean_diffusivities(self.diffusivity, u)
 
     @property
     def is_affine(self) -> bool:
-        """It is."""
+        """True: the rate is affine in u."""
         return True
 
     @property
@@ -73,10 +73,10 @@ class Diffusion(Equation):
         return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The largest diffusivity times the bound of the Laplacian's eigenvalues, or the largest of the operators'."""
+        """The largest diffusivity times the Laplacian's bound, or the largest bound of the stencils."""
         return spread_bound(surface, self.diffusivity, self.boundary, t, u)
 
     def spectral_width(self, t, surface: Surface, u):
-        """The largest diffusivity times the Laplacian's width, or the largest of the operators'."""
+        """The largest diffusivity times the Laplacian's width, or the largest width of the stencils."""
         del t
         return spread_width(surface, self.diffusivity, u)

@@ -1,4 +1,4 @@
-"""What every equation answers: its rate of change, and how stiff it is."""
+"""The interface of equations: the rate of change of a state, and bounds of its stiffness."""
 
 import abc
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from .boundary import Condition
 class Equation(eqx.Module):
     """An evolution equation u_t = rate(t, surface, u) on a surface.
 
-    An equation of your own needs `rate` and `spectral_bound`. With `explicit_rate` it can be stepped by
-    implicit-explicit solvers, and with `diffusivities` its implicit stages are preconditioned by multigrid.
+    A subclass must define `rate` and `spectral_bound`. Define `explicit_rate` to use implicit-explicit solvers, and
+    `diffusivities` to precondition implicit stages by multigrid.
     """
 
     @abc.abstractmethod
@@ -25,19 +25,21 @@ class Equation(eqx.Module):
 
     @abc.abstractmethod
     def spectral_bound(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
-        """An upper bound of the magnitude of the eigenvalues of the rate's derivative at the state."""
+        """An upper bound of the magnitudes of the eigenvalues of the rate's derivative at the state."""
 
     def spectral_width(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
-        """How far those eigenvalues lie off the real axis, as `ltl.operators.spectral_width` has it; by default as far as the
-        Laplacian's, in proportion to the bounds."""
+        """The extent of those eigenvalues off the real axis, as in `ltl.operators.spectral_width`.
+
+        By default that of the Laplacian, scaled by the ratio of the spectral bounds.
+        """
         bound = self.spectral_bound(t, surface, u)
         return bound * (spectral_width(surface) / spectral_bound(surface)).astype(bound.dtype)
 
     def explicit_rate(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
-        """The part of the rate that is not stiff; what remains, `implicit_rate`, must be affine in u."""
+        """The nonstiff part of the rate; the rest, `implicit_rate`, must be affine in u."""
         raise NotImplementedError(
-            f"{type(self).__name__} does not say which part of its rate is not stiff. Define explicit_rate and "
-            "implicit_rate, or take a solver that does not split the rate, such as ltl.TRBDF2() or ltl.RKL2()."
+            f"{type(self).__name__} does not define the nonstiff part of its rate. Define explicit_rate and "
+            "implicit_rate, or use a solver that does not split the rate, such as ltl.TRBDF2() or ltl.RKL2()."
         )
 
     def implicit_rate(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
@@ -45,12 +47,12 @@ class Equation(eqx.Module):
         return self.rate(t, surface, u) - self.explicit_rate(t, surface, u)
 
     def diffusivities(self, u: Float[Array, "V *S"]) -> Float[Array, "*S"]:
-        """How fast each species of the state diffuses: what multigrid preconditions with."""
+        """The diffusivity of each species, from which multigrid builds its preconditioner."""
         return jnp.zeros(u.shape[1:], u.dtype)
 
     @property
     def size(self) -> Callable[[Array], Array]:
-        """``u -> sizes (S,)``, the largest magnitude of each species of a state, which tolerances are relative to."""
+        """``u -> sizes (S,)``: the largest magnitude of each species of a state; tolerances are relative to it."""
         return _largest
 
     @property
@@ -59,7 +61,7 @@ class Equation(eqx.Module):
         return False
 
     def held(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
-        """The state with the values that boundary conditions hold; the state itself where there are none."""
+        """The state with the values that boundary conditions hold; by default the state itself."""
         del t, surface
         return u
 

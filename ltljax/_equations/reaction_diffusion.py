@@ -1,4 +1,4 @@
-"""Several species that diffuse, drift and react."""
+"""Reaction-diffusion: several species that diffuse, drift and react."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -14,7 +14,7 @@ from .equation import Equation
 from .kinetics import Kinetics
 from .spreads import Spread, as_spreads, mean_diffusivities, spread_bound, spread_rate, spread_width
 
-# A spectral radius is estimated from the power of this many squarings.
+# Number of squarings of a matrix in the bound of its spectral radius.
 _SQUARINGS = 6
 
 
@@ -24,16 +24,16 @@ class ReactionDiffusion(Equation):
     The state is one array (V, S).
 
     Attributes:
-        diffusivity: for each species how it spreads: a number D for D Delta u; a non-negative field (V,) for
-            div(D grad u), which may jump, and through a zero of which nothing flows (`weighted_laplacian` with the
-            harmonic mean); an `EllipticStencil` for D : Hess u + b . grad u, such as diffusion along a direction field
-            or drift with a flow (b is minus the velocity). (S,) where all are numbers, else a tuple.
+        diffusivity: one diffusivity per species, in one of three forms. A number D for D Delta u. A non-negative field
+            (V,) for div(D grad u), which may jump; zeros block the flux (`weighted_laplacian` with the harmonic mean).
+            An `EllipticStencil` for D : Hess u + b . grad u, such as diffusion along a direction field or drift with a
+            flow (b is minus the velocity). An array (S,) if all are numbers, otherwise a tuple.
         reaction: a `Kinetics`, or a plain function ``((u, v), params) -> (du, dv)`` of the species, each an array (V,)
-            over the vertices: what is written in arithmetic holds at every one of them. A function of a single point,
-            such as a neural network, goes through `jax.vmap`.
-        params: the parameters of a plain function; a pytree of scalars, or of fields (V,) over the surface.
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several, for all species or some; without any the normal
-            derivatives vanish.
+            over the vertices. Arithmetic acts on all vertices at once; wrap a function of a single point, such as a
+            neural network, in `jax.vmap`.
+        params: parameters of a plain function: a pytree of scalars, or of fields (V,) over the surface.
+        boundary: boundary conditions: `Neumann`, `Dirichlet` or `Robin`, or a tuple of these, for all species or some.
+            By default the normal derivatives vanish.
 
     Source: Chen, Chi and Wu, arXiv 0907.1817, section 4; Turing (1952), doi:10.1098/rstb.1952.0012.
     """
@@ -59,22 +59,22 @@ class ReactionDiffusion(Equation):
         return len(self.diffusivity)
 
     def rate(self, t, surface: Surface, u):
-        """The time derivative: diffusion of every species and the reaction at every vertex."""
+        """The time derivative: the diffusion of every species plus the reaction at every vertex."""
         return self.implicit_rate(t, surface, u) + self.explicit_rate(t, surface, u)
 
     def implicit_rate(self, t, surface: Surface, u):
-        """The diffusion of every species; of a value that is held, that value's rate."""
+        """The diffusion of every species; for held values, their own time derivative."""
         self._check(u)
         u = self.held(t, surface, u)
         spread = spread_rate(surface, self.diffusivity, self.boundary, t, u)
         return bounds.held_rate(surface, self.boundary, t, u, spread)
 
     def explicit_rate(self, t, surface: Surface, u):
-        """The reaction at every vertex; zero where a value is held."""
+        """The reaction at every vertex, zero at held values."""
         return bounds.released(surface, self.boundary, self.reaction(self.held(t, surface, u)))
 
     def diffusivities(self, u):
-        """One number for each species; of what varies, the mean."""
+        """One diffusivity per species, averaged if it varies over the surface."""
         self._check(u)
         return mean_diffusivities(self.diffusivity, u)
 
@@ -88,31 +88,33 @@ class ReactionDiffusion(Equation):
         return bounds.held(surface, self.boundary, t, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The diffusion's bound plus the spectral radius of the reaction's largest derivatives, nearly
-        independent of the units of the species."""
+        """The diffusion's bound plus the spectral radius of the matrix of the reaction's largest derivatives.
+
+        It is nearly independent of the units of the species.
+        """
         self._check(u)
         reaction = _spectral_radius(jnp.max(jnp.abs(self._jacobian(u)), axis=0))
         return spread_bound(surface, self.diffusivity, self.boundary, t, u) + reaction
 
     def spectral_width(self, t, surface: Surface, u):
-        """The diffusion's width plus twice the largest frequency at which the reaction turns a state about another."""
+        """The diffusion's width plus twice the largest frequency at which the reaction can oscillate."""
         del t
         self._check(u)
         jacobian = self._jacobian(u)
         if u.shape[1] == 2:
-            # Two species turn about one another where one promotes and is inhibited by the other, which need not be at
-            # the same vertex, as diffusion leads from one to another.
+            # Two species oscillate if one promotes the other, which inhibits it. The largest derivatives may occur at
+            # different vertices, because diffusion couples them.
             promotes, inhibits = (jnp.max(jnp.maximum(part, 0), axis=0) for part in (jacobian, -jacobian))
             products = promotes * inhibits.T
             frequency = jnp.sqrt(jnp.maximum(products[0, 1], products[1, 0]))
         else:
-            # More of them also turn in longer cycles.
+            # Three or more species can also oscillate in longer cycles.
             others = 1 - jnp.eye(u.shape[1], dtype=u.dtype)
             frequency = _spectral_radius(jnp.max(jnp.abs(jacobian), axis=0) * others)
         return spread_width(surface, self.diffusivity, u) + 2 * frequency
 
     def _jacobian(self, u: Array) -> Array:
-        """The derivatives of the reaction's rates at every vertex, (V, S, S); what bounds steps has no derivatives."""
+        """The derivatives of the reaction's rates at every vertex, (V, S, S), as constants for differentiation."""
         species = jnp.eye(u.shape[1], dtype=u.dtype)
         columns = [jax.jvp(self.reaction, (u,), (jnp.broadcast_to(unit[None], u.shape),))[1] for unit in species]
         return jax.lax.stop_gradient(jnp.stack(columns, axis=2))
@@ -120,20 +122,22 @@ class ReactionDiffusion(Equation):
     def _check(self, u: Array) -> None:
         if u.ndim != 2 or u.shape[1] != self.num_species:
             raise ValueError(
-                f"Expected a state of shape (V, {self.num_species}), one column for each diffusivity, found {u.shape}."
+                f"Expected a state of shape (V, {self.num_species}), one column per diffusivity, found {u.shape}."
             )
 
 
 def _spectral_radius(a: Float[Array, "S S"]) -> Float[Array, ""]:
-    """The spectral radius of a non-negative matrix, which a change of the species' units leaves as it is; of more than
-    two species a bound that such a change hardly changes."""
+    """The spectral radius of a non-negative matrix, or for more than two species a close upper bound of it.
+
+    The spectral radius does not depend on the units of the species, and the bound hardly does.
+    """
     if len(a) == 1:
         return a[0, 0]
     if len(a) == 2:
         half = (a[0, 0] - a[1, 1]) / 2
         across = jnp.sqrt(a[0, 1]) * jnp.sqrt(a[1, 0])
         return (a[0, 0] + a[1, 1]) / 2 + jnp.hypot(half, across)
-    # The norm of the power 2^n is at least the radius to that power.
+    # The norm of A^(2^n) is at least the spectral radius to the power 2^n.
     logarithm = jnp.zeros((), a.dtype)
     for squaring in range(_SQUARINGS + 1):
         a = a @ a if squaring else a

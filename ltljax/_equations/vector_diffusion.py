@@ -1,4 +1,4 @@
-"""Tangent vector fields that diffuse and react."""
+"""Diffusion and reaction of tangent vector fields."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,18 +19,18 @@ Reaction = Callable[..., AnyArray]
 class VectorDiffusion(Equation):
     """X_t = D Delta X + f(X) for a tangent field X, the state (V, 3).
 
-    Delta is `vector_laplacian`; a normal part of the start is left out. Without a reaction no vector becomes longer
-    than the longest at the start (with `Monotone`).
+    Delta is `vector_laplacian`. The normal part of the initial state is ignored. With `Monotone` and without a
+    reaction, no vector becomes longer than the longest one at the start.
 
     Attributes:
         diffusivity: D, a positive number.
-        reaction: f, a plain function ``(X, params) -> rate`` of the vector at one point, (3,); of the rate the tangent
-            part counts. None for none.
-        params: the parameters of the reaction, a pytree.
-        symmetry: n where the state is the n-th power, in the frames, of a field that looks the same after a turn by
-            1/n: see `connection`.
+        reaction: f, a plain function ``(X, params) -> rate`` of the vector (3,) at one point, whose tangent part is
+            used; or None.
+        params: parameters of the reaction, a pytree.
+        symmetry: n if the state represents a field with n-fold rotational symmetry, as in `connection`.
 
-    Source: Chen, Chi and Wu, arXiv 0907.1817, who announce vector-valued data; the operator as of `vector_laplacian`.
+    Source: Chen, Chi and Wu, arXiv 0907.1817, who announce vector-valued data; for the operator, see
+    `vector_laplacian`.
     """
 
     diffusivity: Float[Array, ""] | float = 1.0
@@ -45,7 +45,7 @@ class VectorDiffusion(Equation):
     def implicit_rate(self, t, surface: Surface, u):
         """D Delta X."""
         del t
-        # Of a surface that stays, XLA weighs the connection once for all steps.
+        # If the surface does not move, XLA hoists the weights of the connection out of the time loop.
         diffused = from_frame(surface, connection(surface, self.symmetry)(to_frame(surface, u)))
         return self.diffusivities(u)[None] * diffused
 
@@ -63,7 +63,7 @@ class VectorDiffusion(Equation):
         return tangential(surface, rate)
 
     def diffusivities(self, u):
-        """D for every component."""
+        """D, once for each component."""
         return jnp.broadcast_to(jnp.asarray(self.diffusivity, u.dtype), u.shape[1:])
 
     @property
@@ -73,7 +73,7 @@ class VectorDiffusion(Equation):
 
     @property
     def size(self):
-        """Of each vector field the largest magnitude of its components, in whichever direction."""
+        """``u -> sizes``: the largest magnitude over all components of each vector field."""
         return _largest
 
     def held(self, t, surface: Surface, u):
@@ -82,8 +82,8 @@ class VectorDiffusion(Equation):
         return tangential(surface, u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """The largest diffusivity times the Laplacian's bound, which is the vector Laplacian's too, and the largest row
-        sum of the reaction's Jacobian."""
+        """D times the bound of the Laplacian, which also bounds the vector Laplacian, plus the largest row sum of the
+        reaction's Jacobian."""
         bound = jnp.max(jnp.abs(self.diffusivities(u))) * spectral_bound(surface)
         if self.reaction is None:
             return bound

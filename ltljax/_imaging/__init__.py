@@ -1,1 +1,1 @@
-"""Image processing, shape processing and flow visualisation on surfaces: one room for each."""
+"""Image processing, mesh processing and flow visualisation on surfaces, one room for each."""

@@ -1,4 +1,4 @@
-"""Reactions: how species change one another at a point, ``((u, v), params) -> (du, dv)``.
+"""Reactions: how species change each other at a point, ``((u, v), params) -> (du, dv)``.
 
 Patterns: `turk`, `gray_scott`, `schnakenberg`, `brusselator`, `barrio`, `gierer_meinhardt`, `meinhardt`. Fronts, waves
 and spirals: `barkley`, `fitzhugh_nagumo`, `allen_cahn`, `ginzburg_landau`, `fisher_kpp`, `lotka_volterra`.

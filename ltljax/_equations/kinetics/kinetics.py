@@ -1,4 +1,4 @@
-"""A reaction as a value: rates of change at a point, their parameters, and where they rest."""
+"""A reaction as a value: the rates of change at a point, their parameters, and a uniform steady state."""
 
 import functools
 from collections.abc import Callable
@@ -17,11 +17,11 @@ class Kinetics(eqx.Module):
     """A reaction with its parameters.
 
     Attributes:
-        rates: ``(species, params) -> rates of change``, a tuple of one array for each species. Arithmetic makes it the
-            same at every vertex: a species is an array (V,). A function of a single point needs `jax.vmap`.
-        params: a pytree of scalars, or of fields (V,) over the surface.
-        species: the names of the species, in the order of the state's columns.
-        resting: ``params -> species`` of a uniform steady state, where one is known in closed form.
+        rates: function ``(species, params) -> rates of change``, a tuple with one array (V,) per species. Arithmetic
+            acts on all vertices at once; wrap a function of a single point in `jax.vmap`.
+        params: pytree of scalars, or of fields (V,) over the surface.
+        species: names of the species, in the order of the state's columns.
+        resting: function ``params -> species`` that returns a uniform steady state, if one is known in closed form.
     """
 
     rates: Rates = eqx.field(static=True)
@@ -34,36 +34,37 @@ class Kinetics(eqx.Module):
         return _together(self.rates, u, self.params)
 
     def steady_state(self) -> Float[Array, " S"]:
-        """A uniform state at which every rate vanishes; of parameters that are fields, the one of their means.
+        """A uniform state (S,) at which every rate vanishes; parameters that are fields are replaced by their means.
 
         Raises:
-            ValueError: none is known in closed form.
+            ValueError: no steady state is known in closed form.
         """
         if self.resting is None:
             raise ValueError(
                 f"No steady state of {getattr(self.rates, '__name__', 'these rates')} is known in closed form. "
-                "Give ltl.solvers.dispersion or ltl.explain yours, as (u, v, ...)."
+                "Pass a state (u, v, ...) to ltl.solvers.dispersion or ltl.explain."
             )
         means = jax.tree.map(lambda p: jnp.mean(jnp.asarray(p, jnp.result_type(float))), self.params)
         return jnp.stack([jnp.asarray(s, jnp.result_type(float)) for s in self.resting(means)])
 
 
 def with_params(rates: Rates, species: tuple[str, ...], resting: Resting, **params: Any) -> Kinetics:
-    """A `Kinetics` whose parameters are arrays, by name."""
+    """A `Kinetics` whose parameters are a dictionary of arrays."""
     return Kinetics(rates, {name: jnp.asarray(value) for name, value in params.items()}, species, resting)
 
 
-# In reverse mode only u is kept for every evaluation, and not each product the rates are made of.
+# Checkpointing stores only u for the reverse pass, and not every intermediate product of the rates.
 @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=0)
 def _together(rates: Rates, u: Array, params: Any) -> Array:
     count = u.shape[1]
     try:
-        found = rates(tuple(u[:, s] for s in range(count)), params)
+        result = rates(tuple(u[:, s] for s in range(count)), params)
     except ValueError as error:
         if "values to unpack" not in str(error):
             raise
         raise ValueError(f"The state has {count} species, and the reaction is for another number: {error}.") from error
-    columns = (found,) if count == 1 and not isinstance(found, tuple | list) and jnp.ndim(found) < 2 else tuple(found)
+    is_single = count == 1 and not isinstance(result, tuple | list) and jnp.ndim(result) < 2
+    columns = (result,) if is_single else tuple(result)
     if len(columns) != count or any(jnp.shape(column) not in ((), u.shape[:1]) for column in columns):
         shapes = ", ".join(str(jnp.shape(column)) for column in columns[:5])
         raise ValueError(

@@ -1,7 +1,7 @@
-"""Reactions that make stationary patterns where one species diffuses faster than another (Turing 1952).
+"""Reactions that form stationary patterns when one species diffuses faster than another (Turing 1952).
 
-Each is `Kinetics` for `ReactionDiffusion`. A species that starts non-negative stays so, unless its docstring says
-otherwise: at zero its rate is not negative, and diffusion with `Monotone` keeps the minimum.
+Each function returns `Kinetics` for `ReactionDiffusion`. Species that start non-negative stay non-negative, unless the
+docstring says otherwise: at zero their rate is not negative, and diffusion with `Monotone` does not lower the minimum.
 """
 
 import jax.numpy as jnp
@@ -50,12 +50,12 @@ def _turk_at_rest(p):
 def gray_scott(feed: Number = 0.04, kill: Number = 0.06) -> Kinetics:
     """du/dt = -u v^2 + F (1 - u), dv/dt = u v^2 - (F + k) v: autocatalysis fed from a reservoir (Gray and Scott 1984).
 
-    Steady state: (1, 0), stable; a finite push starts a pattern: spots that divide, stripes, waves. Diffusivities of
-    (2e-5, 1e-5) suit a unit square, and a unit sphere with many spots.
+    The steady state (1, 0) is stable, so a pattern needs a finite perturbation: spots that divide, stripes or waves.
+    Diffusivities of (2e-5, 1e-5) suit a unit square, or a unit sphere with many spots.
 
     Args:
-        feed: F, the rate at which u flows in.
-        kill: k, the rate at which v is removed beyond the outflow.
+        feed: F, inflow rate of u.
+        kill: k, removal rate of v beyond the outflow.
 
     Source: Pearson (1993), doi:10.1126/science.261.5118.189.
     """
@@ -69,15 +69,15 @@ def _gray_scott(species, p):
 
 
 def schnakenberg(a: Number = 0.1, b: Number = 0.9, rate: Number = 100.0) -> Kinetics:
-    """du/dt = gamma (a - u + u^2 v), dv/dt = gamma (b - u^2 v): an activator that uses up its substrate.
+    """du/dt = gamma (a - u + u^2 v), dv/dt = gamma (b - u^2 v): an activator that depletes its substrate.
 
     Steady state: u = a + b, v = b / (a + b)^2. For (a, b) = (.1, .9) patterns form when v diffuses more than 8.6 times
-    as fast as u; with diffusivities (1, 10) their wavelength is 2 pi / sqrt(0.3 gamma), nearly.
+    as fast as u. With diffusivities (1, 10) their wavelength is about 2 pi / sqrt(0.3 gamma).
 
     Args:
-        a: the inflow of u.
-        b: the inflow of v.
-        rate: gamma, the speed of the reaction, which sets how fine the pattern is.
+        a: inflow of u.
+        b: inflow of v.
+        rate: gamma, the speed of the reaction; larger values make finer patterns.
 
     Source: Schnakenberg (1979), doi:10.1016/0022-5193(79)90042-0.
     """
@@ -98,13 +98,13 @@ def _schnakenberg_at_rest(p):
 def brusselator(a: Number = 3.0, b: Number = 10.2) -> Kinetics:
     """du/dt = a - (b + 1) u + u^2 v, dv/dt = b u - u^2 v: the Brusselator.
 
-    Steady state: u = a, v = b / a. It oscillates where b > 1 + a^2; spots, stripes and holes form below where u
-    diffuses slowly enough. The ratio of the diffusivities picks the kind: with (a, b) = (3, 10.2) and 10 / S for v,
-    3.8 / S for u gives stripes, 2.5 / S spots, 5 / S holes.
+    Steady state: u = a, v = b / a. It oscillates if b > 1 + a^2. Below that, spots, stripes and holes form if u
+    diffuses slowly enough. The ratio of the diffusivities selects the pattern: for (a, b) = (3, 10.2) and 10 / S for v,
+    u gives stripes with 3.8 / S, spots with 2.5 / S and holes with 5 / S.
 
     Args:
-        a: the inflow of u.
-        b: the rate of its conversion.
+        a: inflow of u.
+        b: conversion rate of u to v.
 
     Source: Prigogine and Lefever (1968), doi:10.1063/1.1668896.
     """
@@ -122,17 +122,17 @@ def barrio(
 ) -> Kinetics:
     """du/dt = alpha u (1 - r1 v^2) + v (1 - r2 u), dv/dt = beta v (1 + (alpha r1 / beta) u v) + u (gamma + r2 v).
 
-    The model of Barrio, Varea, Aragon and Maini, which picks spots or stripes by the balance of its quadratic and
-    cubic terms. Steady state: (0, 0); u and v are departures from it, of either sign. Spots: diffusivities
-    0.516 D and D with D = 0.0045 on the unit sphere, cubic 0.02, quadratic 0.2. Stripes: D = 0.0021, cubic 3.5,
-    quadratic 0, which take twenty times as long.
+    In the model of Barrio, Varea, Aragon and Maini, the balance of quadratic and cubic terms selects spots or stripes.
+    Steady state: (0, 0); u and v are deviations from it, of either sign. Spots: diffusivities 0.516 D and D with
+    D = 0.0045 on the unit sphere, cubic 0.02, quadratic 0.2. Stripes: D = 0.0021, cubic 3.5, quadratic 0; they take
+    twenty times as long.
 
     Args:
         alpha: growth of u.
         beta: decay of v.
-        gamma: inhibition of v by u; the state (0, 0) is the only uniform one where gamma = -alpha.
-        cubic: r1, the strength of the cubic terms.
-        quadratic: r2, the strength of the quadratic terms.
+        gamma: inhibition of v by u; if gamma = -alpha, (0, 0) is the only uniform steady state.
+        cubic: r1, coefficient of the cubic terms.
+        quadratic: r2, coefficient of the quadratic terms.
 
     Source: Barrio, Varea, Aragon and Maini (1999), doi:10.1006/bulm.1998.0093, equation 5.
     """
@@ -150,7 +150,7 @@ def barrio(
 
 def _barrio(species, p):
     u, v = species
-    # beta v (1 + (alpha r1 / beta) u v), written so that beta may be zero.
+    # This form of beta v (1 + (alpha r1 / beta) u v) allows beta = 0.
     du = p["alpha"] * u * (1 - p["cubic"] * v**2) + v * (1 - p["quadratic"] * u)
     dv = p["beta"] * v + p["alpha"] * p["cubic"] * u * v**2 + u * (p["gamma"] + p["quadratic"] * v)
     return du, dv
@@ -161,14 +161,14 @@ def gierer_meinhardt(
 ) -> Kinetics:
     """du/dt = u^2 / v - mu u + sigma, dv/dt = u^2 - nu v: an activator and its inhibitor.
 
-    Steady state: u = (nu + sigma) / mu, v = u^2 / nu. Spots form where v diffuses much faster than u: diffusivities
-    (4e-3, 4e-2) on the unit sphere. v is taken as at least ``floor`` in the quotient, which keeps the rate finite.
+    Steady state: u = (nu + sigma) / mu, v = u^2 / nu. Spots form if v diffuses much faster than u, for example with
+    diffusivities (4e-3, 4e-2) on the unit sphere. The quotient uses max(v, floor), which keeps the rate finite.
 
     Args:
-        decay: mu, of the activator u.
-        inhibitor_decay: nu, of the inhibitor v.
-        source: sigma, a basic production of u, without which u can die out.
-        floor: the least v in the quotient.
+        decay: mu, decay rate of the activator u.
+        inhibitor_decay: nu, decay rate of the inhibitor v.
+        source: sigma, basic production of u; without it u can die out.
+        floor: smallest v in the quotient.
 
     Source: Gierer and Meinhardt (1972), doi:10.1007/BF00289234.
     """
@@ -198,7 +198,7 @@ def meinhardt(
     production: Number = 0.04, decay: Number = 0.06, inhibitor_decay: Number = 0.06, relay: Number = 0.04,
     source: Number = 0.01, floor: Number = 1e-3,
 ) -> Kinetics:  # fmt: skip
-    """Five species that make stripes: two activators that exclude one another where they are, and help nearby.
+    """Five species that form stripes: two activators that exclude each other locally and support each other nearby.
 
     dg/dt = c q g^2 / r - a g + s
     dh/dt = c p h^2 / r - a h + s
@@ -206,19 +206,19 @@ def meinhardt(
     dp/dt = k (g - p)
     dq/dt = k (h - q)
 
-    The repressor r is shared, so that at a point g or h wins; p and q carry the help to the neighbourhood, so that
-    each needs the other near by: stripes. Diffusivities: small for g, h and r, about twenty times larger for p and q,
-    such as (.009, .009, 0, .2, .2) on a grid of unit spacing; for a surface scale them all. Steady state:
-    g = h = p = q = (b / 2 + s) / a, r = c g^3 2 / b. r is taken as at least ``floor`` in the quotients.
+    The two activators g and h share the repressor r, so one of them wins at each point. Their support spreads through p
+    and q, so each needs the other nearby, which makes stripes. Diffusivities: small for g, h and r, and about twenty
+    times larger for p and q, such as (.009, .009, 0, .2, .2) on a grid of unit spacing; scale all of them for a
+    surface. Steady state: g = h = p = q = (b / 2 + s) / a, r = 2 c g^3 / b. The quotients use max(r, floor).
 
     Args:
-        production: c, of the activators.
-        decay: a, of the activators; random variation over the vertices seeds the pattern.
-        inhibitor_decay: b, of the repressor.
-        relay: k, the rate at which p and q follow g and h.
-        source: s, a basic production of the activators; without one a species that is driven out does not come back,
+        production: c, production rate of the activators.
+        decay: a, decay rate of the activators; random variation over the vertices seeds the pattern.
+        inhibitor_decay: b, decay rate of the repressor.
+        relay: k, rate at which p and q follow g and h.
+        source: s, basic production of the activators; without it a species does not come back after it has vanished,
             and both may die out.
-        floor: the least r in the quotients.
+        floor: smallest r in the quotients.
 
     Source: Meinhardt (1982), Models of Biological Pattern Formation, section 12; Turk (1991),
     doi:10.1145/127719.122749, appendix.

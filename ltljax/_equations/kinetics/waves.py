@@ -1,7 +1,6 @@
-"""Reactions that make fronts, waves and spirals, and domains that grow.
+"""Reactions that form fronts, waves, spirals and coarsening domains.
 
-Each is `Kinetics` for `ReactionDiffusion`. What is said of non-negative species in the patterns' room holds here where
-a docstring says so.
+Each function returns `Kinetics` for `ReactionDiffusion`. Species stay non-negative only where the docstring says so.
 """
 
 import jax.numpy as jnp
@@ -13,16 +12,16 @@ Number = float | Array
 
 
 def barkley(a: Number = 0.75, b: Number = 0.02, epsilon: Number = 0.02) -> Kinetics:
-    """du/dt = u (1 - u) (u - (v + b) / a) / eps, dv/dt = u - v: an excitable medium, FitzHugh-Nagumo made cheap.
+    """du/dt = u (1 - u) (u - (v + b) / a) / eps, dv/dt = u - v: an excitable medium, a cheap FitzHugh-Nagumo model.
 
-    Steady state: (0, 0), stable; a push beyond the threshold u = b / a starts a wave, and a wave that is cut curls
-    into spirals: from u = (1 + tanh(2 x + y)) / 2, v = (1 - tanh(3 z)) / 2 on the unit sphere, diffusivities (.03, 0).
-    u stays between 0 and 1, v too, where they start so.
+    The steady state (0, 0) is stable. A perturbation beyond the threshold u = b / a starts a wave, and a broken wave
+    curls into spirals: for example from u = (1 + tanh(2 x + y)) / 2, v = (1 - tanh(3 z)) / 2 on the unit sphere with
+    diffusivities (.03, 0). If u and v start between 0 and 1, they stay there.
 
     Args:
-        a: makes waves longer.
-        b: raises the threshold.
-        epsilon: how much faster u is than v.
+        a: larger values make waves longer.
+        b: larger values raise the threshold.
+        epsilon: time scale of u relative to v; small values make u fast.
 
     Source: Barkley (1991), doi:10.1016/0167-2789(91)90194-E.
     """
@@ -35,16 +34,16 @@ def _barkley(species, p):
 
 
 def fitzhugh_nagumo(epsilon: Number = 10.0, slope: Number = 0.9, offset: Number = 0.0) -> Kinetics:
-    """du/dt = u - u^3 - v, dv/dt = eps (u - a v - c): a nerve's pulse, reduced to two species of either sign.
+    """du/dt = u - u^3 - v, dv/dt = eps (u - a v - c): a nerve pulse, reduced to two species of either sign.
 
-    The steady state is unique where a < 1, and (0, 0) for c = 0. Labyrinths of stripes form where v diffuses more than
-    eps (1 + sqrt(1 - a))^2 times as fast as u (17 for the defaults), such as with diffusivities (3e-4, 3e-2) on a
-    square; c turns them into spots. With a small eps the medium is excitable or oscillates.
+    The steady state is unique if a < 1, and is (0, 0) if c = 0. Labyrinths of stripes form if v diffuses more than
+    eps (1 + sqrt(1 - a))^2 times as fast as u (17 for the defaults), for example with diffusivities (3e-4, 3e-2) on a
+    square. A nonzero c turns them into spots. With a small eps the medium is excitable or oscillates.
 
     Args:
-        epsilon: the speed of v relative to u.
+        epsilon: speed of v relative to u.
         slope: a, below one.
-        offset: c.
+        offset: c, offset of the line on which dv/dt vanishes.
 
     Source: FitzHugh (1961), doi:10.1016/S0006-3495(61)86902-6; Nagumo, Arimoto and Yoshizawa (1962),
     doi:10.1109/JRPROC.1962.288235.
@@ -67,13 +66,13 @@ def _fitzhugh_nagumo_at_rest(p):
 
 
 def allen_cahn(rate: Number = 1.0) -> Kinetics:
-    """du/dt = r (u - u^3): two phases, -1 and 1, that separate; their domains coarsen, driven by curvature.
+    """du/dt = r (u - u^3): two phases, -1 and 1, that separate into domains, which coarsen by curvature.
 
-    With diffusivity D a front is sqrt(2 D / r) wide and moves with D times its geodesic curvature. u stays within
-    [-1, 1] where it starts so. The state (0) is steady and unstable. State (V, 1).
+    With diffusivity D, a front is sqrt(2 D / r) wide and moves with D times its geodesic curvature. If u starts in
+    [-1, 1], it stays there. The steady state (0) is unstable. The state is (V, 1).
 
     Args:
-        rate: r.
+        rate: r, speed of the reaction.
 
     Source: Allen and Cahn (1979), doi:10.1016/0001-6160(79)90196-2.
     """
@@ -86,14 +85,14 @@ def _allen_cahn(species, p):
 
 
 def ginzburg_landau(imaginary: Number = 1.5, growth: Number = 1.0) -> Kinetics:
-    """dw/dt = mu w - (1 + i b) w |w|^2 for w = u + i v: oscillations that order into spirals.
+    """dw/dt = mu w - (1 + i b) w |w|^2 for w = u + i v: oscillations that organise into spirals.
 
-    The state (0, 0) is steady and unstable; w = sqrt(mu) exp(-i b mu t) is the uniform oscillation. Equal
-    diffusivities, such as (1e-3, 1e-3) on the unit sphere, from small noise. Species of either sign.
+    The steady state (0, 0) is unstable, and w = sqrt(mu) exp(-i b mu t) is the uniform oscillation. Use equal
+    diffusivities, such as (1e-3, 1e-3) on the unit sphere, and start from small noise. u and v have either sign.
 
     Args:
-        imaginary: b, how the frequency falls with the amplitude.
-        growth: mu.
+        imaginary: b, decrease of the frequency with the squared amplitude.
+        growth: mu, growth rate of small oscillations.
 
     Source: Aranson and Kramer (2002), doi:10.1103/RevModPhys.74.99, equation 1 with a real diffusivity.
     """
@@ -112,13 +111,13 @@ def _ginzburg_landau(species, p):
 
 
 def fisher_kpp(rate: Number = 1.0, capacity: Number = 1.0) -> Kinetics:
-    """du/dt = r u (1 - u / K): a population that grows and spreads; fronts move at 2 sqrt(D r).
+    """du/dt = r u (1 - u / K): a population that grows and spreads, with fronts that move at 2 sqrt(D r).
 
-    Steady states: K, stable, and 0, unstable. u stays within [0, K] where it starts so. State (V, 1).
+    The steady state K is stable, and 0 is unstable. If u starts in [0, K], it stays there. The state is (V, 1).
 
     Args:
-        rate: r.
-        capacity: K.
+        rate: r, growth rate.
+        capacity: K, carrying capacity.
 
     Source: Fisher (1937), doi:10.1111/j.1469-1809.1937.tb02153.x; Kolmogorov, Petrovsky and Piskunov (1937).
     """
@@ -133,16 +132,16 @@ def _fisher_kpp(species, p):
 def lotka_volterra(
     growth: Number = 1.0, predation: Number = 1.0, death: Number = 1.0, conversion: Number = 1.0
 ) -> Kinetics:
-    """du/dt = u (a - b v), dv/dt = v (d u - c): prey and predators, whose numbers chase one another over the surface.
+    """du/dt = u (a - b v), dv/dt = v (d u - c): prey and predators, whose populations oscillate.
 
-    Steady state: u = c / d, v = a / b, a centre: every orbit at a point is closed, and diffusion synchronises them.
-    Both species stay non-negative.
+    The steady state u = c / d, v = a / b is a centre: every orbit at a point is closed, and diffusion synchronises the
+    points. Both species stay non-negative.
 
     Args:
-        growth: a, of the prey u.
-        predation: b.
-        death: c, of the predators v.
-        conversion: d, of prey into predators.
+        growth: a, growth rate of the prey u.
+        predation: b, rate of predation.
+        death: c, death rate of the predators v.
+        conversion: d, conversion rate of prey into predators.
 
     Source: Lotka (1920), doi:10.1073/pnas.6.7.410; Volterra (1926), doi:10.1038/118558a0.
     """

@@ -1,7 +1,6 @@
-"""Field lines of a vector field on a mesh, and where on it they may start.
+"""Streamlines of a vector field on a mesh, and the checks of fields and seeds.
 
-What enters: a surface, a tangent field on its vertices, and seeds. What leaves: points along the field lines. Here too
-is what is wrong with a field or with seeds before anyone walks.
+What enters: a surface, a tangent field on its vertices, and seeds. What leaves: points along the field lines.
 """
 
 from typing import Any
@@ -19,11 +18,11 @@ from ..._tables import AnyArray
 from ..._tables.table import take
 from .walking import CORNERS, faces_along, start, walk
 
-# Edges that a line may cross in one step beside those of its length: around a vertex, and where faces are small.
-_AROUND = 32
-# Edges crossed in the length of an edge: at most 2.31 where all faces are equilateral.
+# Extra edges that a line may cross in one step, around a vertex or where faces are small.
+_EXTRA_CROSSINGS = 32
+# Edges crossed per edge length; on equilateral faces there are at most 2.31.
 _PER_EDGE = 2.5
-# The share of edges, in percent, that are shorter than what counts as a short one.
+# Percentile of the edge lengths that defines a short edge.
 _SHORT = 5
 
 Points = tuple[Int[AnyArray, " N"], Float[AnyArray, "N 3"]]
@@ -33,9 +32,9 @@ class Streamlines(eqx.Module):
     """Field lines as points at equal distances.
 
     Attributes:
-        points: (N, steps + 1, 3) the positions, the first the seed.
-        is_valid: (N, steps + 1) false from where a line has ended at a boundary or a zero of the field, or has crossed
-            too many edges in one step; its points stay there.
+        points: (N, steps + 1, 3) positions along each line, beginning with the seed.
+        is_valid: (N, steps + 1) False after a line has ended, at a boundary or a zero of the field or because it
+            crossed too many edges in one step. The points after the end repeat the last one.
     """
 
     points: Float[Array, "N T 3"]
@@ -52,30 +51,28 @@ def streamlines(
     *,
     is_directed: bool = True,
 ) -> Streamlines:
-    """The field lines of X from some seeds, as points at equal distances along them: second order.
+    """The `Streamlines` of X from given seeds: points at equal distances along the field lines, second order accurate.
 
-    Inside every face the midpoint rule; a line that leaves a face goes on in the next from the point where it crosses
-    the edge. Against the field with -X. Differentiable in X, but for which edges are crossed.
+    Lines are integrated face by face with the midpoint rule, and continue in the next face from the point where they
+    cross the edge. Use -X to go against the field. Differentiable in X for a fixed sequence of edges crossed.
 
-    So that every loop ends, a step crosses at most 32 edges and 2.5 for each short edge in its length (shorter are 5 %
-    of the edges; where the surface is traced, an edge as long as the step). A line that would cross more in one step,
-    as with a long step through the finest part of a graded mesh, ends there: shorter steps take it further.
+    The number of edges crossed in one step is limited, to 32 plus 2.5 times the step over the length of a short edge.
+    The short edge is the fifth percentile of all edges; if the surface is traced, it is taken as long as the step. A
+    line that would cross more edges ends there. This can happen with long steps through the finest part of a graded
+    mesh, and shorter steps avoid it.
 
     Args:
         surface: the surface.
-        X: (V, 3), tangent; its length does not count.
+        X: (V, 3) tangent field; only its direction matters.
         seeds: indices of vertices (N,), or faces (N,) and barycentric weights (N, 3).
-        length: of the lines.
-        step: the distance of the points; about half the mean edge length by default, and shortened to divide the
-            length.
-        is_directed: false where X and -X mean the same, as principal directions of curvature do: each line then goes on
-            the way it came.
-
-    Returns:
-        The `Streamlines`.
+        length: length of the lines.
+        step: distance of the points; by default about half the mean edge length. It is shortened to divide the length.
+        is_directed: False if X and -X mean the same, as for principal directions of curvature. A line then takes the
+            sign that continues its own direction.
 
     Raises:
-        ValueError: X does not fit or is not tangent, a seed is not on the surface, or length or step is not positive.
+        ValueError: X does not fit the surface or is not tangent, a seed is not on the surface, or the length or the
+            step is not positive.
 
     Source: Polthier and Schmies (1998), Straightest geodesics on polyhedral surfaces, doi:10.1007/978-3-662-03567-2_11,
     for integration over faces.
@@ -86,26 +83,30 @@ def streamlines(
     if not length > 0 or not step > 0:
         raise ValueError(f"Expected a positive length and step, found {length} and {step}.")
     steps = int(np.ceil(float(length) / float(step) - 1e-9))
-    most, each = _AROUND + most_crossings(surface, length / steps, step), jnp.asarray(length / steps, surface.dtype)
-    return _streamlines(surface, X, face, weights, each, steps, most, is_directed)
+    segments = _EXTRA_CROSSINGS + most_crossings(surface, length / steps, step)
+    return _streamlines(
+        surface, X, face, weights, jnp.asarray(length / steps, surface.dtype), steps, segments, is_directed
+    )
 
 
 @eqx.filter_jit
-def _streamlines(surface, X, face, weights, step, steps, most, is_directed) -> Streamlines:
+def _streamlines(
+    surface: Surface, X: Array, face: Array, weights: Array, step: Array, steps: int, segments: int, is_directed: bool
+) -> Streamlines:
     faces = faces_along(surface, X)
 
     def advance(walkers, _):
-        def stretch(carry, _):
-            def further(carry):
+        def segment(carry, _):
+            def walk_on(carry):
                 walkers, room = carry
-                walkers, gone, _ = walk(faces, walkers, room, 1.0, is_directed)
-                return walkers, jnp.where(walkers.walks, room - gone, room)
+                walkers, length, _ = walk(faces, walkers, room, 1.0, is_directed)
+                return walkers, jnp.where(walkers.walks, room - length, room)
 
             walkers, room = carry
-            return jax.lax.cond(jnp.any(walkers.walks & (room > 0)), further, lambda carry: carry, carry), None
+            return jax.lax.cond(jnp.any(walkers.walks & (room > 0)), walk_on, lambda carry: carry, carry), None
 
         full = jnp.full(walkers.face.shape, step)
-        (walkers, room), _ = jax.lax.scan(stretch, (walkers, full), length=most)
+        (walkers, room), _ = jax.lax.scan(segment, (walkers, full), length=segments)
         arrived = walkers.walks & (room <= 0)
         walkers = eqx.tree_at(lambda w: w.walks, walkers, arrived)
         return walkers, (positions(surface, walkers.face, walkers.weights), arrived)
@@ -123,10 +124,10 @@ def positions(surface: Surface, face: Array, weights: Array) -> Float[Array, "N 
 
 
 def tangent_field(surface: Surface, X: AnyArray) -> Float[Array, "V 3"]:
-    """X in the surface's float type, once it has been found to be a tangent field.
+    """The tangent field X in the surface's float type.
 
     Raises:
-        ValueError: it has not the shape (V, 3), or vectors that are not finite or not tangent.
+        ValueError: X does not have the shape (V, 3), or a vector is NaN, infinite or not tangent.
     """
     if jnp.shape(X) != (surface.num_vertices, 3):
         raise ValueError(
@@ -138,20 +139,20 @@ def tangent_field(surface: Surface, X: AnyArray) -> Float[Array, "V 3"]:
 
 
 def checked_points(surface: Surface, seeds: AnyArray | Points) -> tuple[Int[Array, " N"], Float[Array, "N 3"]]:
-    """Faces and barycentric weights of points that are given so or as vertices.
+    """The faces (N,) and barycentric weights (N, 3) of points, which are given in this form or as vertices.
 
     Raises:
         ValueError: a point is not on the surface.
     """
     faces, num_faces = surface.faces, len(surface.faces)
     if not isinstance(seeds, tuple):
-        at = jnp.asarray(seeds, jnp.int32)
-        if at.ndim != 1:
-            raise ValueError(f"Expected seeds as vertices (N,) or as faces (N,) and weights, found {at.shape}.")
-        _check_range(at, surface.num_vertices, "a seed", "vertex")
-        # Any face at the vertex will do: a walker goes around it to where the field leads.
+        vertices = jnp.asarray(seeds, jnp.int32)
+        if vertices.ndim != 1:
+            raise ValueError(f"Expected seeds as vertices (N,) or as faces (N,) and weights, found {vertices.shape}.")
+        _check_range(vertices, surface.num_vertices, "a seed", "vertex")
+        # Any face at the vertex will do, because a walker goes around the vertex to where the field leads.
         slots = jnp.zeros(surface.num_vertices, jnp.int32)
-        slots = slots.at[faces.reshape(-1)].max(jnp.arange(3 * num_faces, dtype=jnp.int32))[at]
+        slots = slots.at[faces.reshape(-1)].max(jnp.arange(3 * num_faces, dtype=jnp.int32))[vertices]
         return slots // 3, (slots[:, None] % 3 == CORNERS).astype(surface.dtype)
     face, weights = jnp.asarray(seeds[0], jnp.int32), jnp.asarray(seeds[1], surface.dtype)
     if face.ndim != 1 or weights.shape != (len(face), 3):
@@ -170,9 +171,9 @@ def checked_points(surface: Surface, seeds: AnyArray | Points) -> tuple[Int[Arra
 
 
 def most_crossings(surface: Surface, length: float, step: float) -> int:
-    """How many edges a line of some length may cross (host).
+    """The number of edges that a line of some length may cross (host).
 
-    As many as in a mesh of short edges; where the surface is traced these count as long as the step.
+    Assumes that all edges are short; if the surface is traced, as long as the step.
     """
     is_unknown = surface.is_traced or isinstance(surface.faces, Tracer)
     short = step if is_unknown else np.percentile(_edges(surface), _SHORT)
@@ -183,8 +184,8 @@ def mean_edge(surface: Surface) -> float:
     """The mesh size as a number (host)."""
     if surface.is_traced or isinstance(surface.faces, Tracer):
         raise ValueError(
-            "Lengths are chosen on the host, but the surface is being traced by a JAX transformation. Give step= and "
-            "length= as numbers."
+            "The default lengths are chosen on the host, but the surface is being traced by a JAX transformation. Give "
+            "step= and length= as numbers."
         )
     return float(surface.mesh_size)
 

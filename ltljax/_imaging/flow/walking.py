@@ -1,10 +1,11 @@
-"""How a walker goes along a vector field over the faces of a mesh: one straight stretch at a time, to the next edge.
+"""Walkers that follow a vector field across the faces of a mesh, one straight segment at a time.
 
-What enters: a surface and a tangent field on its vertices, and walkers. What leaves: the walkers after a stretch.
+What enters: a surface, a tangent field on its vertices, and walkers. What leaves: the walkers after one segment, which
+ends at the next edge or earlier.
 
-A walker knows its face and its barycentric weights there, and directions are rates of these weights: nothing but edge
-lengths is needed to measure them, and a step over an edge is a permutation. Inside a face the field is interpolated
-from the corners, its part in the plane of the face taken, and its length left out.
+A walker is a face and barycentric weights there, and a direction is the rate of change of these weights. Measuring
+directions then takes edge lengths alone, and crossing an edge is a permutation. Inside a face the field is interpolated
+from the corners, projected to the plane of the face and normalised.
 """
 
 import equinox as eqx
@@ -15,20 +16,20 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._surface import Surface
 from ..._tables.table import take
 
-# Shorter than this share of the longest vector a vector has no direction.
+# Vectors shorter than this, relative to the longest one, count as zeros of the field.
 VANISHES = 1e-6
 CORNERS = np.arange(3, dtype=np.int32)[None]
 
 
-class Faces(eqx.Module):
-    """The faces as a walker sees them. Edge i is opposite to corner i.
+class WalkFaces(eqx.Module):
+    """The faces of a mesh with a vector field, as walkers need them. Edge i is opposite to corner i.
 
     Attributes:
-        rates: (F, 3, 3) how fast the weight of corner i changes along the vector at corner k, at [face, k, i].
-        squares: (F, 3) the squared length of edge i.
-        behind: (F, 3) of the face g behind edge i and the corner j that is opposite there, 3 g + j; on a boundary the
-            edge itself, 3 f + i.
-        apexes: (F, 3, 3) the weights in this face of that corner, with the face g unfolded into the plane.
+        rates: (F, 3, 3) rate of change of the weight of corner i along the vector at corner k, at [face, k, i].
+        squares: (F, 3) squared length of edge i.
+        behind: (F, 3) index 3 g + j of the neighbour across edge i: its face g, and its corner j opposite the edge. On
+            a boundary, the index 3 f + i of the edge itself.
+        apexes: (F, 3, 3) weights in this face of the corner j, with the face g unfolded into the plane of this face.
     """
 
     rates: Float[Array, "F 3 3"]
@@ -38,14 +39,14 @@ class Faces(eqx.Module):
 
 
 class Walkers(eqx.Module):
-    """Where walkers are.
+    """Positions and directions of walkers.
 
     Attributes:
-        face: (N,).
-        weights: (N, 3) barycentric.
-        heading: (N, 3) the rates of the weights along the last stretch.
-        entered: (N,) the edge they came in by, 3 if none.
-        walks: (N,) false once they have met a boundary, or a zero of the field.
+        face: (N,) face.
+        weights: (N, 3) barycentric weights.
+        heading: (N, 3) rates of the weights along the last segment.
+        entered: (N,) edge through which the walker entered the face, or 3.
+        walks: (N,) False once the walker has reached a boundary or a zero of the field.
     """
 
     face: Int[Array, " N"]
@@ -55,140 +56,154 @@ class Walkers(eqx.Module):
     walks: Bool[Array, " N"]
 
 
-def faces_along(surface: Surface, X: Float[Array, "V 3"]) -> Faces:
-    """The faces of a surface with a field on them."""
+def faces_along(surface: Surface, X: Float[Array, "V 3"]) -> WalkFaces:
+    """The faces of a surface with the field X."""
     faces = surface.faces
     largest = jnp.max(jnp.sum(X**2, axis=1))
     X = X / jnp.sqrt(jnp.where(largest > 0, largest, 1))
     corners = take(surface.vertices, faces)
     edges = jnp.roll(corners, -2, axis=1) - jnp.roll(corners, -1, axis=1)
-    across = jnp.cross(edges[:, 0], edges[:, 1])
-    doubled = jnp.sqrt(jnp.maximum(jnp.sum(across**2, axis=1), jnp.finfo(X.dtype).tiny))
-    unit = across / doubled[:, None]
-    slopes = jnp.cross(unit[:, None], edges) / doubled[:, None, None]
+    cross = jnp.cross(edges[:, 0], edges[:, 1])
+    doubled_areas = jnp.sqrt(jnp.maximum(jnp.sum(cross**2, axis=1), jnp.finfo(X.dtype).tiny))
+    normals = cross / doubled_areas[:, None]
+    slopes = jnp.cross(normals[:, None], edges) / doubled_areas[:, None, None]
     squares = jnp.sum(edges**2, axis=2)
     behind = _behind(faces)
-    # Along edge i, from corner i + 1: where the corners opposite to it on either side have their feet.
+    # Positions along edge i, from corner i + 1, of the feet of the opposite corners on its two sides.
     feet = jnp.sum((corners - jnp.roll(corners, -1, axis=1)) * edges, axis=2) / squares
     opposite = corners.reshape(-1, 3)[behind]
     other_feet = jnp.sum((opposite - jnp.roll(corners, -1, axis=1)) * edges, axis=2) / squares
-    own = -doubled[behind // 3] / doubled[:, None]
-    second = other_feet - own * feet
-    by_offset = jnp.stack([own, 1 - own - second, second], axis=2)
+    first = -doubled_areas[behind // 3] / doubled_areas[:, None]
+    third = other_feet - first * feet
+    by_offset = jnp.stack([first, 1 - first - third, third], axis=2)
     offsets = (CORNERS[0][None, :] - CORNERS[0][:, None]) % 3
     apexes = jnp.take_along_axis(by_offset, jnp.broadcast_to(offsets[None], by_offset.shape), axis=2)
-    return Faces(jnp.einsum("fic,fkc->fki", slopes, take(X, faces)), squares, behind, apexes)
+    return WalkFaces(jnp.einsum("fic,fkc->fki", slopes, take(X, faces)), squares, behind, apexes)
 
 
-def start(faces: Faces, face: Array, weights: Array, sense: float | Array) -> Walkers:
-    """Walkers at points of faces, ready to go along the field (sense 1) or against it (-1)."""
+def start(faces: WalkFaces, face: Array, weights: Array, sense: float | Array) -> Walkers:
+    """Walkers at points of faces, which will follow the field (sense 1) or go against it (-1)."""
     nearest = jnp.argmax(weights, axis=1)
     heading = sense * faces.rates[face, nearest]
-    # Off vertices and edges, so that every way out of the face is through the inside of one edge.
+    # Walkers start off vertices and edges, so each leaves its face through the interior of one edge.
     weights = _inside(weights, jnp.full(face.shape, 3, jnp.int32))
     return Walkers(face, weights, heading, jnp.full(face.shape, 3, jnp.int32), jnp.ones(face.shape, bool))
 
 
 def walk(
-    faces: Faces, walkers: Walkers, room: Array, sense: float | Array, is_directed: bool
+    faces: WalkFaces, walkers: Walkers, room: Array, sense: float | Array, is_directed: bool
 ) -> tuple[Walkers, Array, tuple[Array, Array]]:
-    """A straight stretch of each walker inside its face, at most ``room`` long: the walkers after it, how far they
-    went, and the face and weights of its middle."""
+    """One straight segment of each walker inside its face, by the midpoint rule, of at most the length ``room``.
+
+    Returns:
+        The walkers after the segment, the lengths they went, and the faces and weights of the segments' midpoints.
+    """
     face, weights = walkers.face, walkers.weights
     rates, squares = faces.rates[face], faces.squares[face]
 
-    def along(at: Array, heading: Array) -> tuple[Array, Array]:
-        corners = rates
+    def direction_at(weights: Array, heading: Array) -> tuple[Array, Array]:
+        """The unit direction of the field, and whether it has one."""
+        vectors = rates
         if not is_directed:
-            turned = _product(corners, heading[:, None], squares[:, None]) < 0
-            corners = jnp.where(turned[:, :, None], -corners, corners)
-        direction = jnp.sum(at[:, :, None] * corners, axis=1) * (sense if is_directed else 1.0)
+            is_opposite = _product(vectors, heading[:, None], squares[:, None]) < 0
+            vectors = jnp.where(is_opposite[:, :, None], -vectors, vectors)
+        direction = jnp.sum(weights[:, :, None] * vectors, axis=1) * (sense if is_directed else 1.0)
         direction = _kept_inside(direction, squares, walkers.entered)
         squared = _product(direction, direction, squares)
-        has_one = squared > VANISHES**2
-        return direction / jnp.sqrt(jnp.where(has_one, squared, 1))[:, None], has_one
+        is_nonzero = squared > VANISHES**2
+        return direction / jnp.sqrt(jnp.where(is_nonzero, squared, 1))[:, None], is_nonzero
 
-    direction, has_one = along(weights, walkers.heading)
-    reach = jnp.min(_reach(weights, direction, walkers.entered), axis=1)
-    half = jnp.minimum(room, reach)[:, None] / 2
-    direction, has_still = along(weights + half * direction, direction)
-    reach = _reach(weights, direction, walkers.entered)
-    goes = walkers.walks & has_one & has_still & (room > 0)
-    out = jnp.argmin(reach, axis=1).astype(jnp.int32)
-    nearest = jnp.min(reach, axis=1)
-    crosses = goes & (nearest <= room)
-    gone = jnp.where(goes, jnp.minimum(room, nearest), 0)
-    after = jnp.maximum(weights + gone[:, None] * direction, 0)
-    middle = (weights + after) / 2
+    direction, starts = direction_at(weights, walkers.heading)
+    nearest = jnp.min(_distances(weights, direction, walkers.entered), axis=1)
+    half = jnp.minimum(room, nearest)[:, None] / 2
+    direction, continues = direction_at(weights + half * direction, direction)
+    distances = _distances(weights, direction, walkers.entered)
+    edge = jnp.argmin(distances, axis=1).astype(jnp.int32)
+    nearest = jnp.min(distances, axis=1)
+    has_direction = walkers.walks & starts & continues
+    moves = has_direction & (room > 0)
+    length = jnp.where(moves, jnp.minimum(room, nearest), 0)
+    end = jnp.maximum(weights + length[:, None] * direction, 0)
 
-    slot = jnp.take_along_axis(faces.behind[face], out[:, None], axis=1)[:, 0]
-    is_rim = slot == 3 * face + out
-    over = crosses & ~is_rim
-    j = slot % 3
-    after = jnp.where(crosses[:, None] & (out[:, None] == CORNERS), 0, after)
-    after = after / jnp.sum(after, axis=1, keepdims=True)
-    order = (out[:, None] + j[:, None] - CORNERS) % 3
-    heading = direction
-    if not is_directed:
-        apex = jnp.take_along_axis(faces.apexes[face, out], order, axis=1)
-        turned = jnp.take_along_axis(direction, order, axis=1)
-        at_j = j[:, None] == CORNERS
-        share = jnp.sum(jnp.where(at_j, turned / apex, 0), axis=1, keepdims=True)
-        heading = jnp.where(over[:, None], jnp.where(at_j, share, turned - share * apex), direction)
-    after = jnp.where(over[:, None], _inside(jnp.take_along_axis(after, order, axis=1), j), after)
-    entered = jnp.where(over, j, jnp.where(goes, 3, walkers.entered))
-    walks = walkers.walks & has_one & has_still & ~(crosses & is_rim)
+    reaches_edge = moves & (nearest <= room)
+    slot = jnp.take_along_axis(faces.behind[face], edge[:, None], axis=1)[:, 0]
+    is_boundary = slot == 3 * face + edge
+    crosses = reaches_edge & ~is_boundary
+    on_edge = jnp.where(reaches_edge[:, None] & (edge[:, None] == CORNERS), 0, end)
+    on_edge = on_edge / jnp.sum(on_edge, axis=1, keepdims=True)
+    next_weights, next_heading = _across(faces, face, edge, slot % 3, on_edge, direction, is_directed)
+    next_weights = jnp.where(crosses[:, None], next_weights, on_edge)
+    next_heading = jnp.where(crosses[:, None], next_heading, direction)
     moved = Walkers(
-        jnp.where(over, slot // 3, face),
-        jnp.where(goes[:, None], after, weights),
-        jnp.where(goes[:, None], heading, walkers.heading),
-        entered,
-        walks | (walkers.walks & (room <= 0)),
+        jnp.where(crosses, slot // 3, face),
+        jnp.where(moves[:, None], next_weights, weights),
+        jnp.where(moves[:, None], next_heading, walkers.heading),
+        jnp.where(crosses, slot % 3, jnp.where(moves, 3, walkers.entered)),
+        (has_direction & ~(reaches_edge & is_boundary)) | (walkers.walks & (room <= 0)),
     )
-    return moved, gone, (face, middle)
+    return moved, length, (face, (weights + end) / 2)
+
+
+def _across(
+    faces: WalkFaces, face: Array, edge: Array, j: Array, weights: Array, direction: Array, is_directed: bool
+) -> tuple[Array, Array]:
+    """Weights and direction in the corners of the neighbouring face, whose corner j is opposite the edge crossed.
+
+    The direction is unfolded if the field has no sign, and otherwise not needed.
+    """
+    order = (edge[:, None] + j[:, None] - CORNERS) % 3
+    next_weights = _inside(jnp.take_along_axis(weights, order, axis=1), j)
+    if is_directed:
+        return next_weights, direction
+    apex = jnp.take_along_axis(faces.apexes[face, edge], order, axis=1)
+    permuted = jnp.take_along_axis(direction, order, axis=1)
+    is_j = j[:, None] == CORNERS
+    rate_of_j = jnp.sum(jnp.where(is_j, permuted / apex, 0), axis=1, keepdims=True)
+    return next_weights, jnp.where(is_j, rate_of_j, permuted - rate_of_j * apex)
 
 
 def _behind(faces: Array) -> Int[Array, "F 3"]:
-    one, other = jnp.roll(faces, -1, axis=1).reshape(-1), jnp.roll(faces, -2, axis=1).reshape(-1)
-    low, high = jnp.minimum(one, other), jnp.maximum(one, other)
+    """The neighbour across each edge, as in `WalkFaces.behind`."""
+    first, second = jnp.roll(faces, -1, axis=1).reshape(-1), jnp.roll(faces, -2, axis=1).reshape(-1)
+    low, high = jnp.minimum(first, second), jnp.maximum(first, second)
     order = jnp.lexsort((high, low)).astype(jnp.int32)
     low, high = low[order], high[order]
     is_pair = (low[1:] == low[:-1]) & (high[1:] == high[:-1])
-    none = jnp.zeros(1, bool)
-    before, after = jnp.concatenate([none, is_pair]), jnp.concatenate([is_pair, none])
-    partner = jnp.where(after, jnp.roll(order, -1), jnp.where(before, jnp.roll(order, 1), order))
+    false = jnp.zeros(1, bool)
+    is_second, is_first = jnp.concatenate([false, is_pair]), jnp.concatenate([is_pair, false])
+    partner = jnp.where(is_first, jnp.roll(order, -1), jnp.where(is_second, jnp.roll(order, 1), order))
     return jnp.zeros_like(order).at[order].set(partner, unique_indices=True).reshape(faces.shape)
 
 
 def _product(p: Array, q: Array, squares: Array) -> Array:
-    """The scalar product of two directions given as rates, whose sums are zero."""
+    """The scalar product of two directions, given as rates of barycentric weights, which sum to zero."""
     mixed = p * jnp.roll(q, -1, axis=-1) + jnp.roll(p, -1, axis=-1) * q
     return -jnp.sum(mixed * jnp.roll(squares, -2, axis=-1), axis=-1) / 2
 
 
 def _kept_inside(direction: Array, squares: Array, entered: Array) -> Array:
-    """The direction, or where it leads back over the edge just crossed its part along that edge.
+    """The direction; if it points back across the edge just crossed, its part along that edge.
 
-    There the field leads to the edge from both sides, as into a valley.
+    It points back where the field leads to the edge from both sides.
     """
     order = (entered[:, None] + CORNERS) % 3
     inwards, _, second = (jnp.take_along_axis(direction, order[:, k : k + 1], axis=1)[:, 0] for k in range(3))
-    own, to_second, to_first = (jnp.take_along_axis(squares, order[:, k : k + 1], axis=1)[:, 0] for k in range(3))
-    # From the first corner of the edge to its second, in units of the edge.
-    slide = second + inwards * (to_first + own - to_second) / (2 * own)
-    along = jnp.stack([jnp.zeros_like(slide), -slide, slide], axis=1)
-    back = jnp.take_along_axis(along, (CORNERS - entered[:, None]) % 3, axis=1)
-    return jnp.where(((entered < 3) & (inwards < 0))[:, None], back, direction)
+    edge, to_second, to_first = (jnp.take_along_axis(squares, order[:, k : k + 1], axis=1)[:, 0] for k in range(3))
+    # The rate from the first corner of the edge to its second, in units of the edge.
+    slide = second + inwards * (to_first + edge - to_second) / (2 * edge)
+    tangential = jnp.stack([jnp.zeros_like(slide), -slide, slide], axis=1)
+    tangential = jnp.take_along_axis(tangential, (CORNERS - entered[:, None]) % 3, axis=1)
+    return jnp.where(((entered < 3) & (inwards < 0))[:, None], tangential, direction)
 
 
-def _reach(weights: Array, direction: Array, entered: Array) -> Array:
-    """How far it is to each edge."""
-    falls = (direction < 0) & (entered[:, None] != CORNERS)
-    return jnp.where(falls, -weights / jnp.where(falls, direction, 1), jnp.inf)
+def _distances(weights: Array, direction: Array, entered: Array) -> Array:
+    """The distance to each edge along a direction; infinite for edges that it does not approach."""
+    approaches = (direction < 0) & (entered[:, None] != CORNERS)
+    return jnp.where(approaches, -weights / jnp.where(approaches, direction, 1), jnp.inf)
 
 
 def _inside(weights: Array, entered: Array) -> Array:
-    """The weights a little away from every edge but the one entered by."""
+    """The weights moved slightly away from every edge except the one just crossed."""
     least = jnp.finfo(weights.dtype).eps ** (2 / 3)
-    kept = jnp.where(entered[:, None] == CORNERS, 0, jnp.maximum(weights, least))
-    return kept / jnp.sum(kept, axis=1, keepdims=True)
+    moved = jnp.where(entered[:, None] == CORNERS, 0, jnp.maximum(weights, least))
+    return moved / jnp.sum(moved, axis=1, keepdims=True)

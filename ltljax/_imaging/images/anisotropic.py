@@ -1,8 +1,8 @@
-"""An image is diffused along its edges and lines, and not across them.
+"""Anisotropic diffusion of images: along edges and lines, and not across them.
 
-What enters: a surface and an image. What leaves: its structure tensor, diffusion tensors made of that, and the image
-after diffusion with them. The neighbours and weights of such a diffusion are chosen on the host and are not negative,
-so that values stay within those of the image, which symmetric differences do not promise.
+What enters: a surface and an image. What leaves: its structure tensor, the diffusion tensors derived from it, and the
+image after diffusion. The neighbours and weights of the diffusion are chosen on the host. The weights are non-negative,
+so values stay within those of the image, which symmetric differences do not guarantee.
 
 Source: Weickert (1998), Anisotropic diffusion in image processing, Teubner, chapter 5 for both tensors.
 """
@@ -17,20 +17,20 @@ from ..._equations import Equation
 from ..._operators import EllipticStencil, divergence, elliptic_stencil, gradient
 from ..._surface import Surface, on_device, on_surface
 from ..._tables import AnyArray
+from .diffusion import evolved, local_mean
 from .signals import number, signal
-from .smoothing import evolved, smoothed
 
-# Weickert's constant: with it the flux grows with the slope up to the contrast, and falls beyond.
+# Weickert's constant, for which the flux increases with the slope up to the contrast and decreases beyond it.
 _STEEPNESS = 3.31488
-# Of diffusion across lines, to that along them.
+# Smallest eigenvalue of a diffusion tensor.
 _LEAST = 1e-3
 
 
 class AnisotropicDiffusion(Equation):
-    """u_t = D : Hess u + b . grad u, or with b = div D, u_t = div(D grad u).
+    """u_t = D : Hess u + b . grad u; with b = div D this is u_t = div(D grad u).
 
     Attributes:
-        stencil: the operator, as `elliptic_stencil` makes it.
+        stencil: the operator, built by `elliptic_stencil`.
     """
 
     stencil: EllipticStencil
@@ -41,12 +41,12 @@ class AnisotropicDiffusion(Equation):
         return self.stencil(u)
 
     def spectral_bound(self, t, surface: Surface, u):
-        """That of the operator."""
+        """The bound of the operator's eigenvalues."""
         del t, surface
         return self.stencil.spectral_bound().astype(u.dtype)
 
     def spectral_width(self, t, surface: Surface, u):
-        """That of the operator."""
+        """The bound of the imaginary parts of the operator's eigenvalues."""
         del t, surface
         return self.stencil.spectral_width().astype(u.dtype)
 
@@ -56,7 +56,7 @@ class AnisotropicDiffusion(Equation):
 
     @property
     def is_affine(self) -> bool:
-        """It is."""
+        """True: the rate is linear in u."""
         return True
 
 
@@ -67,46 +67,49 @@ def structure_tensor(
     scale: float | AnyArray,
     integration_scale: float | AnyArray,
 ) -> Float[Array, "V 3 3"]:
-    """The mean of grad u_s grad u_s^T over a window, symmetric, non-negative and tangent, in ambient coordinates.
+    """The local mean of grad u_s grad u_s^T: a symmetric, non-negative, tangent tensor in ambient coordinates.
 
-    Its first eigenvector is the direction in which the image changes most, its eigenvalues the mean squares of the
-    slopes along and across; of colours the tensors are added. The image is averaged over a window of radius ``scale``
-    first, the products over one of radius ``integration_scale``. That second mean is taken of ambient components and
-    projected to the tangent plane, which is right to the order of (window times curvature)^2.
+    Its leading eigenvector is the direction in which the image changes most; its eigenvalues are the mean squares of
+    the slopes along that direction and across it. The tensors of several colours are added. First the image is averaged
+    over windows of ``scale``, then the products over windows of ``integration_scale`` (see `local_mean`). The second
+    mean is taken component by component and projected to the tangent plane, with an error of the order of (window times
+    curvature)^2.
 
     Args:
         surface: the surface.
-        u: (V,) or (V, C).
-        scale: a length; noise below it is not seen.
-        integration_scale: a length, of a few lines.
+        u: image, (V,) or (V, C).
+        scale: length below which noise is ignored.
+        integration_scale: length over which directions are averaged, a few lines wide.
 
     Raises:
-        ValueError: u does not fit the surface or is not finite, or a length is negative.
+        ValueError: u does not fit the surface or is NaN or infinite, or a length is negative.
     """
-    slopes = gradient(surface, smoothed(surface, u, scale)).reshape(surface.num_vertices, -1, 3)
+    slopes = gradient(surface, local_mean(surface, u, scale)).reshape(surface.num_vertices, -1, 3)
     products = jnp.einsum("vci,vcj->vij", slopes, slopes).reshape(-1, 9)
-    return _onto_tangent_planes(surface, smoothed(surface, products, integration_scale).reshape(-1, 3, 3))
+    return _onto_tangent_planes(surface, local_mean(surface, products, integration_scale).reshape(-1, 3, 3))
 
 
 @on_device
 def diffusion_tensor(
     surface: Surface, structure: Float[AnyArray, "..."], contrast: float | AnyArray, enhancing: str = "edges"
 ) -> Float[Array, "V 3 3"]:
-    """The tensor of a diffusion that enhances edges or lines, with eigenvalues from 0.001 to 1.
+    """The tensor (V, 3, 3) of a diffusion that enhances edges or lines, with eigenvalues from 0.001 to 1.
 
-    With mu_1 >= mu_2 the eigenvalues of the structure tensor. Edges: along the edge 1, across it
-    ``1 - exp(-3.31488 / (mu_1 / contrast^2)^4)``, near 1 where slopes are well below the contrast and near 0 above.
-    Coherence: across lines 0.001, along them ``0.001 + 0.999 exp(-(contrast^2 / (mu_1 - mu_2))^2)``, near 1 where one
-    direction prevails and 0.001 where none does.
+    Let mu_1 >= mu_2 be the eigenvalues of the structure tensor.
+
+    - ``"edges"``: the eigenvalue is 1 along the edge and ``1 - exp(-3.31488 / (mu_1 / contrast^2)^4)`` across it, which
+      is near 1 where slopes are well below the contrast and near 0 above it.
+    - ``"coherence"``: the eigenvalue is 0.001 across lines and ``0.001 + 0.999 exp(-(contrast^2 / (mu_1 - mu_2))^2)``
+      along them, which is near 1 where one direction dominates and 0.001 where none does.
 
     Args:
         surface: the surface.
-        structure: (V, 3, 3), of `structure_tensor`.
-        contrast: a slope, in units of u over a length.
+        structure: (V, 3, 3) tensor from `structure_tensor`.
+        contrast: threshold of the slope, in units of u over a length.
         enhancing: ``"edges"`` or ``"coherence"``.
 
     Raises:
-        ValueError: an unknown kind of tensor, or one that does not fit the surface.
+        ValueError: ``enhancing`` is unknown, or the tensor does not fit the surface.
 
     Source: Weickert (1998), sections 5.1 and 5.2.
     """
@@ -120,13 +123,13 @@ def diffusion_tensor(
     x, y = (planar[:, 0, 0] - planar[:, 1, 1]) / 2, planar[:, 0, 1]
     root = jnp.sqrt(x**2 + y**2 + tiny**2)
     if enhancing == "edges":
-        # At a tenth the exponential is zero, in any float; below, its derivative would be zero times infinity.
+        # At 0.1 the exponential underflows to zero; below, its derivative would be zero times infinity.
         ratio = jnp.maximum((half + root) / squared, 0.1)
         across, along = jnp.maximum(1 - jnp.exp(-_STEEPNESS / ratio**4), _LEAST), 1.0
     else:
         ratio = jnp.minimum(squared / (2 * root), 100)
         across, along = _LEAST, _LEAST + (1 - _LEAST) * jnp.exp(-(ratio**2))
-    # The unit tensor of the plane, and that of the two directions, the first with the sign of plus.
+    # The identity of the tangent plane, and the reflection that is +1 across the edge and -1 along it.
     plane = jnp.einsum("vai,vaj->vij", frames, frames)
     reflection = jnp.stack([jnp.stack([x, y], axis=1), jnp.stack([y, -x], axis=1)], axis=1) / root[:, None, None]
     reflection = jnp.einsum("vai,vab,vbj->vij", frames, reflection, frames)
@@ -145,29 +148,30 @@ def anisotropic_diffusion(
     rtol: float = 1e-3,
     progress: bool = False,
 ) -> Float[Array, "V *C"]:
-    """The image after u_t = div(D grad u) (host): values stay within those of u.
+    """The image after u_t = div(D grad u), with values within those of u (host).
 
-    As D : Hess u + (div D) . grad u, with the non-negative weights of `elliptic_stencil`. Where D changes by much from
-    one vertex to the next these add diffusion, as little as weights without negative ones allow.
+    Discretises D : Hess u + (div D) . grad u with the non-negative weights of `elliptic_stencil`. Where D varies
+    strongly from vertex to vertex, these add the smallest diffusion that non-negative weights allow.
 
     Args:
-        surface: the surface, not traced; u may be.
-        u: (V,) or (V, C).
-        tensor: D, (V, 3, 3), symmetric and non-negative, of which the tangent part counts.
-        time: in units of a length squared, over that of D.
-        rtol: relative tolerance of a step.
-        progress: whether to show how far the choice of neighbours is.
+        surface: the surface; it must not be traced, but u may be.
+        u: image, (V,) or (V, C).
+        tensor: D, (V, 3, 3), symmetric and non-negative; only its tangent part is used.
+        time: duration, in units of length squared divided by the unit of D.
+        rtol: relative tolerance of a time step.
+        progress: whether to show the progress of the choice of neighbours.
 
     Raises:
-        ValueError: something does not fit the surface or is not finite, D is not symmetric or not non-negative, the
-            time is negative, or the surface or D is being traced.
+        ValueError: an array does not fit the surface or is NaN or infinite, D is not symmetric or has a negative
+            eigenvalue, the time is negative, or the surface or D is being traced.
     """
     u = signal(surface, u)
     _check_tensor(surface, tensor)
     if isinstance(tensor, Tracer):
         raise ValueError(
             "The neighbours of a diffusion are chosen on the host, but its tensor is being traced by a JAX "
-            "transformation. Call this function outside, or use ltl.operators.elliptic_stencil and its `with_coefficients`."
+            "transformation. Call this function outside the transformation, or use ltl.operators.elliptic_stencil and "
+            "its `with_coefficients`."
         )
     tensor = jnp.asarray(tensor, surface.dtype)
     drift = divergence(surface, tensor)
@@ -185,22 +189,22 @@ def edge_enhancing(
     rounds: int = 4,
     **options,
 ) -> Float[Array, "V *C"]:
-    """The image smoothed where it is flat, and along its edges (host).
+    """The image diffused where it is flat, and along its edges (host).
 
     Args:
         surface: the surface.
-        u: (V,) or (V, C); colours have their edges in common.
-        time: in units of a length squared.
-        contrast: slopes above it are edges.
-        scale: the radius of the window that slopes are taken of; by default the mean length of the edges of the mesh.
-        rounds: how often the tensor is computed anew.
-        **options: of `anisotropic_diffusion`.
+        u: image, (V,) or (V, C); its colours share their edges.
+        time: duration, in units of length squared.
+        contrast: slopes above this are edges.
+        scale: standard deviation of the window over which slopes are averaged; by default the mean edge length.
+        rounds: number of times that the tensor is computed.
+        **options: ``rtol`` and ``progress``, as in `anisotropic_diffusion`.
 
     Raises:
-        ValueError: as `anisotropic_diffusion`.
+        ValueError: as in `anisotropic_diffusion`, or there is less than one round.
     """
     scale = surface.mesh_size if scale is None else scale
-    # Edges are where they are: the products are not averaged.
+    # An integration scale of zero keeps edges sharply localised.
     return _in_rounds(surface, u, time, rounds, lambda u: _tensor(surface, u, contrast, scale, 0.0, "edges"), options)
 
 
@@ -215,25 +219,32 @@ def coherence_enhancing(
     rounds: int = 4,
     **options,
 ) -> Float[Array, "V *C"]:
-    """The image smoothed along its lines, whose gaps close (host).
+    """The image diffused along its lines, which closes gaps in them (host).
 
     Args:
         surface: the surface.
-        u: (V,) or (V, C).
-        time: in units of a length squared.
-        contrast: where the slopes in both directions differ by more there is a line; those of noise should be below.
-        scale: the radius of the window that slopes are taken of; by default the mean length of the edges of the mesh.
-        integration_scale: that over which directions are averaged; by default three times ``scale``.
-        rounds: how often the tensor is computed anew.
-        **options: of `anisotropic_diffusion`.
+        u: image, (V,) or (V, C).
+        time: duration, in units of length squared.
+        contrast: slopes in the two principal directions that differ by more than this mark a line; choose it above the
+            slopes of the noise.
+        scale: standard deviation of the window over which slopes are averaged; by default the mean edge length.
+        integration_scale: standard deviation of the window over which directions are averaged; by default three times
+            ``scale``.
+        rounds: number of times that the tensor is computed.
+        **options: ``rtol`` and ``progress``, as in `anisotropic_diffusion`.
 
     Raises:
-        ValueError: as `anisotropic_diffusion`.
+        ValueError: as in `anisotropic_diffusion`, or there is less than one round.
     """
     scale = surface.mesh_size if scale is None else number(surface, "scale", scale)
-    wide = 3 * scale if integration_scale is None else integration_scale
+    integration_scale = 3 * scale if integration_scale is None else integration_scale
     return _in_rounds(
-        surface, u, time, rounds, lambda u: _tensor(surface, u, contrast, scale, wide, "coherence"), options
+        surface,
+        u,
+        time,
+        rounds,
+        lambda u: _tensor(surface, u, contrast, scale, integration_scale, "coherence"),
+        options,
     )
 
 
@@ -247,16 +258,16 @@ def _in_rounds(
 ) -> Array:
     if rounds < 1:
         raise ValueError(f"Expected at least one round, found {rounds}.")
-    u, share = signal(surface, u), number(surface, "time", time, may_be_zero=True) / rounds
+    u, duration = signal(surface, u), number(surface, "time", time, may_be_zero=True) / rounds
     for _ in range(rounds):
-        found = tensor(u)
-        if isinstance(found, Tracer):
+        diffusion = tensor(u)
+        if isinstance(diffusion, Tracer):
             raise ValueError(
-                "The neighbours are chosen on the host, anew in every round, but the surface, the image or a number is "
-                "being traced by a JAX transformation. Call this function outside; or compute a tensor outside, with "
-                "ltl.imaging.diffusion_tensor, for ltl.imaging.anisotropic_diffusion, whose image may be traced."
+                "The neighbours are chosen on the host in every round, but the surface, the image or a number is being "
+                "traced by a JAX transformation. Call this function outside the transformation. To trace the image "
+                "alone, compute a tensor with ltl.imaging.diffusion_tensor and call ltl.imaging.anisotropic_diffusion."
             )
-        u = anisotropic_diffusion(surface, u, found, share, **options)
+        u = anisotropic_diffusion(surface, u, diffusion, duration, **options)
     return u
 
 

@@ -1,19 +1,19 @@
-"""Where is the total variation, weighed against data, least? By the primal-dual Newton method.
+"""Minimiser of a data term plus the total variation, by the primal-dual Newton method.
 
-What enters: a surface, data with their weights, which vertices are free, and how much the total variation weighs. What
-leaves: the minimiser, with derivatives by the implicit function theorem. The field is piecewise linear over the faces,
-so its gradient is one vector g on each of them, and the functional
+What enters: a surface, data with their weights, a mask of the free vertices, and the weight of the total variation.
+What leaves: the minimiser, with derivatives by the implicit function theorem. The field u is linear on each face, so
+its gradient is one vector g per face. The functional
 
     1/2 sum_v m_v |u_v - f_v|^2 + strength sum_F A_F sqrt(|g_F|^2 + rounding^2)
 
-is convex. The gradient of a colour image is a matrix g with the norm sqrt(sum_c |g_c|^2): one edge for all colours.
+is convex. For a colour image, g is a matrix with the norm sqrt(sum_c |g_c|^2), so all colours share their edges.
 
-Newton's method for the optimality condition alone converges only from nearby; with the dual variable
-``p = g / sqrt(|g|^2 + rounding^2)`` as an unknown of its own it takes 8 to 23 steps on Spot, of 829 and of 11,533
-vertices alike, for roundings from 0.1 to 1e-4 and tolerances from 1e-4 to 1e-10.
+Newton's method on the optimality condition alone converges only from nearby. With the dual variable
+``p = g / sqrt(|g|^2 + rounding^2)`` as a separate unknown it takes 8 to 23 iterations on Spot, with 829 vertices as
+with 11,533, for roundings from 0.1 to 1e-4 and tolerances from 1e-4 to 1e-10.
 
 Source: Chan, Golub and Mulet (1999), A nonlinear primal-dual method for total variation-based image restoration,
-doi:10.1137/S1064827596299767; with p projected onto the unit ball, Hintermueller and Stadler (2006),
+doi:10.1137/S1064827596299767; the projection of p onto the unit ball, Hintermueller and Stadler (2006),
 doi:10.1137/040613263.
 """
 
@@ -26,22 +26,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._surface import Surface
+from .conjugate_gradients import SplitPreconditioner, conjugate_gradients
 
-# Linear systems are solved to this share of their right side within Newton's method, and to this one for derivatives.
+# Relative residual tolerances of the linear systems: within Newton's method, and for derivatives.
 _FORCING = 1e-2
 _EXACT = {jnp.dtype("float64"): 1e-11, jnp.dtype("float32"): 1e-5}
 _MAX_ITERATIONS = 2000
 _MAX_HALVINGS = 12
 
 
-class Faces(eqx.Module):
-    """The gradient of piecewise linear fields: constant on each face, in a frame of its own.
+class HatGradients(eqx.Module):
+    """The gradient of fields that are linear on each face, in an orthonormal frame of the face.
 
     Attributes:
-        corners: (F, 3) the vertices.
-        hats: (2, 2, F) the gradients of the hat functions of the second and third corner; that of the first is minus
+        corners: (F, 3) vertices of each face.
+        hats: (2, 2, F) gradients of the hat functions of the second and third corner; that of the first corner is minus
             their sum. Zero on a face without area.
-        areas: (F,).
+        areas: (F,) face areas.
     """
 
     corners: Int[Array, "F 3"]
@@ -49,14 +50,14 @@ class Faces(eqx.Module):
     areas: Float[Array, " F"]
 
     @classmethod
-    def of(cls, surface: Surface) -> "Faces":
-        """Those of a surface."""
+    def from_surface(cls, surface: Surface) -> "HatGradients":
+        """The hat functions of a surface."""
         a, b, c = jnp.moveaxis(surface.vertices[surface.faces], 1, 0)
         ab, ac = b - a, c - a
         length_squared = jnp.sum(ab**2, axis=1)
         tiny = jnp.finfo(ab.dtype).tiny
         length = jnp.sqrt(jnp.where(length_squared > tiny, length_squared, 1))
-        # In the frame whose first axis is the first edge: b = (length, 0), c = (x, y).
+        # The first axis of the frame is the first edge: b = (length, 0), c = (x, y).
         x = jnp.sum(ab * ac, axis=1) / length
         height_squared = jnp.sum((ac - (x / length)[:, None] * ab) ** 2, axis=1)
         is_flat = height_squared <= 1e3 * tiny
@@ -65,7 +66,7 @@ class Faces(eqx.Module):
         return cls(surface.faces, jnp.where(is_flat, 0, hats), jnp.where(is_flat, 0, length * y / 2))
 
     def gradient(self, u: Float[Array, "V C"]) -> Float[Array, "2 F C"]:
-        """The gradient on every face."""
+        """The gradient of u on every face."""
         a, b, c = (u[self.corners[:, corner]] for corner in range(3))
         return self.hats[0][..., None] * (b - a)[None] + self.hats[1][..., None] * (c - a)[None]
 
@@ -85,18 +86,18 @@ class Faces(eqx.Module):
 
 
 class Functional(eqx.Module):
-    """What is made least.
+    """The functional to minimise.
 
     Attributes:
-        faces: where gradients live.
-        masses: (V,) the weights of the data.
-        is_free: (V,) 1 where u may change, 0 where it is held.
-        f: (V, C) the data.
-        strength: of the total variation.
-        rounding: slopes well below this count as flat.
+        faces: gradient operator.
+        masses: (V,) weights m of the data.
+        is_free: (V,) 1 where u is free, 0 where it is held at the data.
+        f: (V, C) data.
+        strength: weight of the total variation.
+        rounding: slope well below which a face counts as flat.
     """
 
-    faces: Faces
+    faces: HatGradients
     masses: Float[Array, " V"]
     is_free: Float[Array, " V"]
     f: Float[Array, "V C"]
@@ -108,7 +109,7 @@ class Functional(eqx.Module):
         return jnp.sqrt(jnp.sum(g**2, axis=(0, 2)) + self.rounding**2)
 
     def rise(self, u: Array, change: Array) -> Array:
-        """What a change of u adds to the functional, without the cancellation of subtracting two values."""
+        """The increase of the functional from u to u + change, without the cancellation of two nearly equal values."""
         g, step = self.faces.gradient(u), self.faces.gradient(change)
         before, after = self.lengths(g), self.lengths(g + step)
         lengthened = jnp.sum(step * (2 * g + step), axis=(0, 2)) / (before + after)
@@ -116,16 +117,16 @@ class Functional(eqx.Module):
         return data + self.strength * jnp.sum(self.faces.areas * lengthened)
 
     def slope(self, u: Float[Array, "V C"]) -> Float[Array, "V C"]:
-        """The derivative of the functional: zero at the minimiser. Where u is held, its distance from the data."""
+        """The derivative of the functional, which vanishes at the minimiser; where u is held, u minus the data."""
         free = self.is_free[:, None]
-        # What is held enters as the data, so that the derivative of this in u is symmetric.
+        # Held values are replaced by the data, which makes the derivative of this function symmetric.
         g = self.faces.gradient(free * u + (1 - free) * self.f)
         p = g / self.lengths(g)[None, :, None]
         pull = self.faces.transposed((self.strength * self.faces.areas)[None, :, None] * p, len(u))
         return free * (self.masses[:, None] * (u - self.f) + pull) + (1 - free) * (u - self.f)
 
     def curvature(self, g: Array, p: Array) -> tuple[Callable[[Array], Array], Array]:
-        """The second derivative, with the dual variable as an unknown of its own, and its diagonal (about)."""
+        """The symmetrised primal-dual Hessian as an operator, and an approximation of its diagonal."""
         lengths, size = self.lengths(g), len(self.masses)
         along = g / lengths[None, :, None]
         weights = self.strength * self.faces.areas / lengths
@@ -141,91 +142,56 @@ class Functional(eqx.Module):
 
 
 def minimise(
-    functional: Functional, start: Float[Array, "V C"], tolerance: Any, max_steps: int
+    functional: Functional, start: Float[Array, "V C"], tolerance: Any, max_iterations: Int[Array, ""] | int
 ) -> tuple[Float[Array, "V C"], Bool[Array, ""], Int[Array, ""]]:
-    """The minimiser, whether it was found, and the number of steps; differentiable in the functional.
+    """The minimiser, whether Newton's method converged, and its number of iterations; differentiable in the functional.
 
-    Ends when a full step changes the root mean square of u over the vertices by at most ``tolerance``. Derivatives are
-    NaN where their linear system was not solved.
+    Stops when a full step changes the root mean square of u over the vertices by at most ``tolerance``. Derivatives are
+    NaN if their linear system was not solved.
     """
     fixed, start = jax.lax.stop_gradient((functional, start))
-    u, found, steps = _newton(fixed, start, jnp.asarray(tolerance, start.dtype), max_steps)
+    u, is_converged, iterations = _newton(fixed, start, jnp.asarray(tolerance, start.dtype), max_iterations)
     g = fixed.faces.gradient(u)
     _, diagonal = fixed.curvature(g, g)
-    share = _EXACT[jnp.dtype(u.dtype)]
+    preconditioner, rtol = SplitPreconditioner.jacobi(diagonal), _EXACT[jnp.dtype(u.dtype)]
 
     def exactly(apply, b):
-        x, missed = conjugate_gradients(apply, b, lambda r: r / diagonal, share, _MAX_ITERATIONS)
-        return jnp.where(missed <= 1, x, jnp.nan)
+        x, is_solved = conjugate_gradients(apply, b, preconditioner, rtol, _MAX_ITERATIONS)
+        return jnp.where(is_solved, x, jnp.nan)
 
     def tangent_solve(apply, b):
         return jax.lax.custom_linear_solve(apply, b, exactly, symmetric=True)
 
-    # Newton's method has found the root; what is left for this is its derivative.
+    # Newton's method has found the root, so custom_root only adds the derivative.
     root = jax.lax.custom_root(lambda u: functional.slope(u), u, lambda _, u: u, tangent_solve)
-    return root, found, steps
+    return root, is_converged, iterations
 
 
-def conjugate_gradients(
-    apply: Callable[[Array], Array],
-    b: Array,
-    inverse: Callable[[Array], Array],
-    share: Any,
-    max_steps: int = _MAX_ITERATIONS,
-) -> tuple[Array, Array]:
-    """The x with ``apply(x) = b`` for a symmetric positive operator, up to a share of b in the norm of the inverse; and
-    the square of what is left over that share, at most one where x was found.
-
-    Args:
-        apply: the operator.
-        b: the right side.
-        inverse: about the inverse of the operator, symmetric and positive.
-        share: of the residual that may be left.
-        max_steps: after which the iteration ends, wherever it is.
-    """
-
-    def goes_on(carry):
-        _, _, _, rho, steps = carry
-        return (rho > goal) & (steps < max_steps)
-
-    def step(carry):
-        x, r, p, rho, steps = carry
-        q = apply(p)
-        along = rho / jnp.maximum(jnp.sum(p * q), tiny)
-        x, r = x + along * p, r - along * q
-        z = inverse(r)
-        rho_next = jnp.sum(r * z)
-        return x, r, z + rho_next / rho * p, rho_next, steps + 1
-
-    tiny = jnp.finfo(b.dtype).tiny
-    z = inverse(b)
-    rho = jnp.sum(b * z)
-    goal = jnp.maximum(jnp.asarray(share, b.dtype) ** 2 * rho, tiny)
-    x, _, _, rho, _ = jax.lax.while_loop(goes_on, step, (jnp.zeros_like(b), b, z, rho, jnp.zeros((), jnp.int32)))
-    return x, rho / goal
-
-
-def _newton(functional: Functional, start: Array, tolerance: Array, max_steps: int) -> tuple[Array, Array, Array]:
+def _newton(
+    functional: Functional, start: Array, tolerance: Array, max_iterations: Array | int
+) -> tuple[Array, Array, Array]:
     faces = functional.faces
 
-    def goes_on(carry):
-        _, _, change, steps = carry
-        # Not "is larger": what is no number ends the loop.
-        return (change > tolerance) & (steps < max_steps)
+    def is_unfinished(carry):
+        _, _, change, iterations = carry
+        # False if the change is NaN, which ends the loop.
+        return (change > tolerance) & (iterations < max_iterations)
 
     def step(carry):
-        u, p, _, steps = carry
+        u, p, _, iterations = carry
         g = faces.gradient(u)
         apply, diagonal = functional.curvature(g, p)
-        du, _ = conjugate_gradients(apply, -functional.slope(u), lambda r: r / diagonal, _FORCING)
+        preconditioner = SplitPreconditioner.jacobi(diagonal)
+        du, _ = conjugate_gradients(apply, -functional.slope(u), preconditioner, _FORCING, _MAX_ITERATIONS)
         lengths = functional.lengths(g)[None, :, None]
         dg = faces.gradient(du)
         p = (g + dg - p * jnp.sum(g * dg, axis=(0, 2))[None, :, None] / lengths) / lengths
         p = p / jnp.maximum(jnp.sqrt(jnp.sum(p**2, axis=(0, 2))), 1)[None, :, None]
-        along = _halved(lambda along: functional.rise(u, along * du), u.dtype)
-        # A step that was shortened says nothing of the distance that is left.
+        fraction = _halved(lambda fraction: functional.rise(u, fraction * du), u.dtype)
+        # The size of a shortened step does not bound the remaining error.
         size = jnp.sqrt(jnp.mean(du**2))
-        return u + along * du, p, jnp.where(along < 1, jnp.maximum(size, 2 * tolerance), size), steps + 1
+        change = jnp.where(fraction < 1, jnp.maximum(size, 2 * tolerance), size)
+        return u + fraction * du, p, change, iterations + 1
 
     g = faces.gradient(start)
     begin = (
@@ -234,12 +200,15 @@ def _newton(functional: Functional, start: Array, tolerance: Array, max_steps: i
         jnp.full((), jnp.inf, start.dtype),
         jnp.zeros((), jnp.int32),
     )
-    u, _, change, steps = jax.lax.while_loop(goes_on, step, begin)
-    return u, change <= tolerance, steps
+    u, _, change, iterations = jax.lax.while_loop(is_unfinished, step, begin)
+    return u, change <= tolerance, iterations
 
 
 def _halved(rise: Callable[[Array], Array], dtype: Any) -> Array:
-    """The longest of 1, 1/2, 1/4, ... that does not let the functional rise."""
-    start = jnp.ones((), dtype)
-    least = 0.5**_MAX_HALVINGS
-    return jax.lax.while_loop(lambda along: (rise(along) > 0) & (along > least), lambda along: along / 2, start)
+    """The largest of 1, 1/2, 1/4, ... at which the functional does not increase."""
+    smallest = 0.5**_MAX_HALVINGS
+    return jax.lax.while_loop(
+        lambda fraction: (rise(fraction) > 0) & (fraction > smallest),
+        lambda fraction: fraction / 2,
+        jnp.ones((), dtype),
+    )

@@ -1,4 +1,4 @@
-"""Images come onto a surface and leave it: through a UV map, or projected from one side (host).
+"""Transfer of images between pixels and vertices, through a UV map or by projection from one side (host).
 
 What enters: a mesh and pixels, or values on its vertices. What leaves: values on its vertices, or pixels.
 """
@@ -11,42 +11,44 @@ from jaxtyping import Bool, Float
 from ..._mesh import Mesh
 from ..flow.views import axes_of
 
-# As near to the rim of the image, in its size, a place counts as on it.
+# Points of the UV map within this distance of the rim of the image, relative to its size, count as on the rim.
 _RIM = 1e-4
 
 
 def from_texture(mesh: Mesh, image: np.ndarray) -> Float[np.ndarray, "V *C"]:
     """The values of an image at the vertices, through the UV map (host).
 
-    Bilinear between the centres of pixels at the place of every corner, then the mean over the corners of each vertex,
-    which differ where two charts meet. What the map places outside the image is repeated; within 1e-4 of the rim it
-    counts as on it, as what rounding has moved across would be read on the other side.
+    The image is interpolated bilinearly between pixel centres at every face corner, then averaged over the corners of
+    each vertex, which differ where two charts meet. Outside the unit square the image repeats. Points within 1e-4 of
+    the rim count as on it: rounding could otherwise move them across, to the opposite side of the image.
 
     Args:
         mesh: a mesh with a UV map, v upwards.
-        image: (H, W) or (H, W, C), the first row at the top: unsigned integers, of which the largest counts as 1, or
-            floats.
+        image: (H, W) or (H, W, C), first row at the top. Floats, or unsigned integers, whose largest value becomes 1.
 
     Returns:
-        (V,) or (V, C); of unsigned integers from 0 to 1.
+        Values (V,) or (V, C); from 0 to 1 if the image has unsigned integers.
 
     Raises:
-        ValueError: the mesh has no UV map, or not of finite numbers, or the image is no image.
+        ValueError: the mesh has no UV map, the map is NaN or infinite somewhere, or the image has a wrong shape or
+            type.
     """
     pixels = _pixels(image)
     if mesh.uv is None:
         raise ValueError(
-            "The mesh has no UV map: its file names no texture coordinates. Use ltl.imaging.project_image, or unwrap "
-            "the mesh first, in Blender say."
+            "The mesh has no UV map, because its file has no texture coordinates. Use ltl.imaging.project_image, or "
+            "unwrap the mesh first, for example in Blender."
         )
     if not np.isfinite(mesh.uv).all():
         face = int(np.argmin(np.isfinite(mesh.uv).all(axis=(1, 2))))
-        raise ValueError(f"Expected a UV map of finite numbers, found others in face {face}. Unwrap the mesh anew.")
+        raise ValueError(
+            f"Expected a finite UV map, found NaN or infinite coordinates in face {face}. Unwrap the mesh again."
+        )
     rim = np.round(mesh.uv)
     uv = np.where(np.abs(mesh.uv - rim) <= _RIM, rim, mesh.uv)
-    # What lies far outside is repeated, so whole turns may be left out.
-    places = (uv - np.floor(uv.min(axis=1, keepdims=True))).reshape(-1, 2)
-    values = _bilinear(pixels, places)
+    # The image repeats, so whole periods are removed.
+    points = (uv - np.floor(uv.min(axis=1, keepdims=True))).reshape(-1, 2)
+    values = _bilinear(pixels, points)
     vertex, count = mesh.faces.ravel(), np.bincount(mesh.faces.ravel(), minlength=mesh.num_vertices)
     columns = values.reshape(len(values), -1).T
     sums = np.stack([np.bincount(vertex, column, mesh.num_vertices) for column in columns], axis=1)
@@ -59,22 +61,22 @@ def project_image(
     direction: Sequence[float | int] = (0, 0, 1),
     up: Sequence[float | int] = (0, 1, 0),
 ) -> tuple[Float[np.ndarray, "V *C"], Bool[np.ndarray, " V"]]:
-    """The values of an image that is projected from one side, and the vertices that face that side (host).
+    """The values of an image projected onto the vertices from one side, and the vertices that face that side (host).
 
-    Without perspective; the image covers the shape's bounding box seen from there. Vertices that face the side get
-    their values even where something stands before them.
+    The projection is orthographic, and the image covers the bounding box of the shape seen from that side. Occlusion is
+    ignored: vertices behind other parts of the shape get values, too.
 
     Args:
-        shape: a mesh; or positions (V, 3) alone, all of which then count as facing.
-        image: (H, W) or (H, W, C), as of `from_texture`.
-        direction: from where.
-        up: what points upwards in the image.
+        shape: a mesh; or positions (V, 3) alone, all of which then count as facing the image.
+        image: (H, W) or (H, W, C), as in `from_texture`.
+        direction: direction from the shape towards the image.
+        up: upward direction in the image.
 
     Returns:
-        Values (V,) or (V, C), and a mask (V,).
+        Values (V,) or (V, C), and a mask (V,) of the vertices that face the image.
 
     Raises:
-        ValueError: the direction is along ``up``, or the image is no image.
+        ValueError: the direction is along ``up``, or the image has a wrong shape or type.
     """
     pixels, axes = _pixels(image), axes_of(direction, up)
     vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, np.float64)
@@ -84,7 +86,7 @@ def project_image(
     if not isinstance(shape, Mesh):
         return values, np.ones(len(vertices), bool)
     a, b, c = np.moveaxis(vertices[shape.faces], 1, 0)
-    # Twice the area of each face as seen from there, negative from behind.
+    # Twice the projected area of each face, negative if it faces away.
     towards = np.repeat(np.cross(b - a, c - a) @ axes[2], 3)
     return values, np.bincount(shape.faces.ravel(), towards, len(vertices)) > 0
 
@@ -97,19 +99,19 @@ def to_texture(
     *,
     as_bytes: bool = False,
 ) -> np.ndarray:
-    """The image in which the UV map finds the values again, (size, size) or (size, size, C) (host).
+    """The image that shows a field through the UV map, (size, size) or (size, size, C) (host).
 
-    Linear inside each face; charts are widened by a few pixels.
+    Values are linear on each face; charts are extended by a few pixels, so that interpolation at their rims is safe.
 
     Args:
         mesh: a mesh with a UV map, v upwards.
-        u: (V,) or (V, C).
-        size: of the image in pixels.
-        fill: the value or colour where no face lies.
-        as_bytes: whether values from 0 to 1 become unsigned bytes; by default they stay floats.
+        u: field, (V,) or (V, C).
+        size: width and height of the image in pixels.
+        fill: value or colour of pixels that no face covers.
+        as_bytes: whether to convert values from 0 to 1 to unsigned bytes; by default the image has floats.
 
     Raises:
-        ValueError: there is no UV map, it is tiled or not finite, or shapes do not fit.
+        ValueError: there is no UV map, it is tiled or NaN or infinite somewhere, or u does not fit the mesh.
     """
     from ..._output.texture import bake
 
@@ -132,26 +134,26 @@ def _pixels(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float64)
 
 
-def _bilinear(pixels: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The values (N,) or (N, C) at places (N, 2), v upwards: from 0 to 1 inside the image, which repeats beyond."""
+def _bilinear(pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The values (N,) or (N, C) at points (N, 2), v upwards; the image covers the unit square and repeats outside."""
     height, width = pixels.shape[:2]
     values = 0.0
-    x, y = _between(places[:, 0], width), _between(1 - places[:, 1], height)
+    x, y = _between(points[:, 0], width), _between(1 - points[:, 1], height)
     for row, by_row in y:
         for column, by_column in x:
-            share = (by_row * by_column).reshape(-1, *[1] * (pixels.ndim - 2))
-            values = values + share * pixels[row, column]
+            weight = (by_row * by_column).reshape(-1, *[1] * (pixels.ndim - 2))
+            values = values + weight * pixels[row, column]
     return np.asarray(values)
 
 
-def _between(place: np.ndarray, count: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """The two pixels of so many between whose centres a place lies, and their shares."""
-    # Pixel centres lie at whole numbers.
-    at = place * count - 0.5
-    low = np.floor(at)
-    share = at - low
-    # Half a pixel inside the rim of the image there is no other side; beyond it there is.
-    is_inside = (place >= 0) & (place <= 1)
+def _between(x: np.ndarray, count: int) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """The two of ``count`` pixels between whose centres a coordinate lies, each with its interpolation weight."""
+    # In this coordinate, pixel centres are integers.
+    position = x * count - 0.5
+    low = np.floor(position)
+    share = position - low
+    # Inside the image, indices are clipped at the rim; outside, the image repeats.
+    is_inside = (x >= 0) & (x <= 1)
     first, second = (
         np.where(is_inside, np.clip(index, 0, count - 1), index % count).astype(np.int64) for index in (low, low + 1)
     )

@@ -202,7 +202,7 @@ def _denoised(subject: Subject, u: np.ndarray, noise: float | None, strength: fl
         return np.asarray(imaging.denoise(surface, f, noise=noise, strength=strength))
     if method == "heat":
         return _matched(subject, u, noise, strength, lambda time: imaging.diffuse(surface, f, time))
-    averaged = imaging.smoothed(surface, f, subject.edge)
+    averaged = imaging.local_mean(surface, f, subject.edge)
     slopes = np.asarray(gradient(surface, averaged)).reshape(len(u), -1)
     contrast = _CONTRAST * float(np.median(np.linalg.norm(slopes, axis=1)))
     if not contrast > 0:

@@ -44,7 +44,7 @@ def smooth(
         mesh: a built-in shape or a mesh file.
         out: the folder to write to.
         method: ``"flow"`` (`imaging.mean_curvature_flow`), ``"fair"`` (`imaging.fair`) or ``"features"``
-            (`imaging.denoise_mesh`), which keeps edges.
+            (`imaging.filter_normals`), which keeps edges.
         time: of the flow, in units of a length squared; by default a quarter of the squared mean edge length.
         strength: of ``fair``, in units of a length squared, by default half the squared mean edge length; of
             ``features``, how far apart normals may be and still count as the same, by default 0.35.
@@ -78,7 +78,7 @@ def smooth(
         moved = imaging.fair(surface, how["strength"], keep_volume=keep_volume)
     else:
         how = dict(strength=0.35 if strength is None else strength, steps=5 if steps is None else steps)
-        moved = imaging.denoise_mesh(surface, how["strength"], normal_iterations=how["steps"])
+        moved = imaging.filter_normals(surface, how["strength"], normal_iterations=how["steps"])
     after = np.asarray(moved, np.float64) + surface.centre
     bends = [np.asarray(curvature_of(at).mean) for at in (surface, surface.with_vertices(moved))]
     way = np.linalg.norm(np.asarray(moved - surface.vertices), axis=1)
