@@ -3,9 +3,9 @@
 from ._base.folder import OutputError
 from ._fit import FitError
 from ._mesh import MeshError
+from ._solve.elliptic import IncompatibleSourceWarning
 from ._solve.evolve import GrowingModesWarning, SolveError
 from ._solve.restart import RestartError
-from ._solve.stationary import IncompatibleSourceWarning
 from ._surface import CoarseMeshWarning, FarFromOriginWarning, InconsistentRowsWarning
 
 __all__ = [

@@ -736,7 +736,7 @@ def test_gradients_of_free_vertices_pass_taylors_test(name):
     def loss(vertices):
         moved = surface.with_vertices(vertices)
         if solver is None:
-            u = ltl.screened_poisson(moved, u0, 1.0, tolerance=1e-12, preconditioner=hierarchy)
+            u = ltl.screened_poisson(moved, u0, 1.0, rtol=1e-12, preconditioner=hierarchy)
         else:
             u = ltl.solve(
                 ltl.Diffusion(0.5), moved, u0, 0.2, solver=solver, dt=dt, rtol=1e-12, throw=False,

@@ -170,7 +170,7 @@ def test_diffusivities_and_conditions_that_do_not_fit_are_rejected():
         ltl.solve(ltl.Diffusion(boundary=ltl.Dirichlet(0.0, species=2)), SURFACE, two, 0.1)
     with pytest.raises(ValueError, match="needs a state of several species"):
         ltl.solve(ltl.Diffusion(boundary=ltl.Dirichlet(0.0, species=0)), SURFACE, two[:, 0], 0.1)
-    with pytest.raises(ValueError, match="solve for each of them by itself"):
+    with pytest.raises(ValueError, match="Solve each of them with a call of its own"):
         ltl.poisson(SURFACE, two, ltl.Dirichlet(0.0, species=0))
 
 

@@ -76,6 +76,10 @@ class Diffusion(Equation):
         """The largest diffusivity times the Laplacian's bound, or the largest bound of the stencils."""
         return spread_bound(surface, self.diffusivity, self.boundary, t, u)
 
+    def diffusion_bound(self, t, surface: Surface, u):
+        """All of `spectral_bound`."""
+        return self.spectral_bound(t, surface, u)
+
     def spectral_width(self, t, surface: Surface, u):
         """The largest diffusivity times the Laplacian's width, or the largest width of the stencils."""
         del t

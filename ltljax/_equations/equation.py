@@ -27,6 +27,11 @@ class Equation(eqx.Module):
     def spectral_bound(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
         """An upper bound of the magnitudes of the eigenvalues of the rate's derivative at the state."""
 
+    def diffusion_bound(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
+        """The part of `spectral_bound` that is due to diffusion; the rest is the reaction's."""
+        del t
+        return jnp.max(self.diffusivities(u)) * spectral_bound(surface)
+
     def spectral_width(self, t: Float[Array, ""], surface: Surface, u: Float[Array, "V *S"]) -> Float[Array, ""]:
         """The extent of those eigenvalues off the real axis, as in `ltl.operators.spectral_width`.
 

@@ -94,7 +94,11 @@ class ReactionDiffusion(Equation):
         """
         self._check(u)
         reaction = _spectral_radius(jnp.max(jnp.abs(self._jacobian(u)), axis=0))
-        return spread_bound(surface, self.diffusivity, self.boundary, t, u) + reaction
+        return self.diffusion_bound(t, surface, u) + reaction
+
+    def diffusion_bound(self, t, surface: Surface, u):
+        """The largest diffusivity times the bound of the Laplacian's eigenvalues, or the largest of the operators'."""
+        return spread_bound(surface, self.diffusivity, self.boundary, t, u)
 
     def spectral_width(self, t, surface: Surface, u):
         """The diffusion's width plus twice the largest frequency at which the reaction can oscillate."""

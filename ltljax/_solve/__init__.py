@@ -3,6 +3,7 @@ multigrid, eigenmodes, and what linear theory says before a run."""
 
 from .direct import Factorized, factorized
 from .distance import geodesic_distance
+from .elliptic import IncompatibleSourceWarning, poisson, screened_poisson
 from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
 from .hodge import HarmonicFields, HodgeParts, harmonic_fields, helmholtz_hodge
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
@@ -11,7 +12,7 @@ from .multigrid import Multigrid, multigrid
 from .restart import RestartError
 from .stabilised import RKL1, RKL2
 from .stability import Dispersion, Explanation, dispersion, explain
-from .stationary import IncompatibleSourceWarning, poisson, screened_poisson, steady_state
+from .stationary import steady_state
 from .vector_heat import connection_matrix, direction_field, transport_vectors
 
 __all__ = [

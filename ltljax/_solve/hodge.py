@@ -1,7 +1,7 @@
-"""Helmholtz and Hodge: a tangent field as a gradient, a rotation and what is neither.
+"""The Helmholtz-Hodge decomposition: a tangent field as the sum of a gradient, a rotation and a harmonic field.
 
-What enters: a surface and a field. What leaves: its three parts, orthogonal to each other in the measure that diffusion
-conserves, and the functions they come from.
+What enters: a surface and a field. What leaves: its three parts, which are orthogonal in the measure that diffusion
+conserves, and their potential and stream function.
 """
 
 import warnings
@@ -18,20 +18,20 @@ from .._operators import check_vectors, curl, curvature, divergence, gradient, t
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .direct import Factorized
+from .elliptic import IncompatibleSourceWarning, poisson
 from .multigrid import Multigrid
-from .stationary import IncompatibleSourceWarning, poisson
 from .vector_heat import connection_matrix, lowest
 
 
 class HodgeParts(eqx.Module):
-    """A tangent field as the sum of three, which are orthogonal in the measure that diffusion conserves.
+    """The three parts of a tangent field, which are orthogonal in the measure that diffusion conserves.
 
     Attributes:
-        gradient: (V, 3) the gradient of the potential.
-        rotation: (V, 3) the part that flows around: n x grad of the stream function, to second order.
-        harmonic: (V, 3) the part with neither divergence nor curl, which flows around the handles.
-        potential: (V,) its mean is zero.
-        stream: (V,) the stream function, of mean zero, or zero on a boundary.
+        gradient: (V, 3) gradient of the potential.
+        rotation: (V, 3) remainder, which is n x grad of the stream function to second order.
+        harmonic: (V, 3) part with neither divergence nor curl, which flows around the handles.
+        potential: (V,) potential, whose mean is zero.
+        stream: (V,) stream function, which is zero on a boundary and has zero mean without one.
     """
 
     gradient: Float[Array, "V 3"]
@@ -42,11 +42,11 @@ class HodgeParts(eqx.Module):
 
 
 class HarmonicFields(eqx.Module):
-    """The harmonic fields of a surface: what `harmonic_fields` returned.
+    """The harmonic fields of a surface, made by `harmonic_fields`.
 
     Attributes:
-        fields: (n, V, 3) tangent, orthonormal in the measure.
-        measure: (V,) the mass that diffusion conserves.
+        fields: (n, V, 3) tangent fields, orthonormal in the measure.
+        measure: (V,) measure that diffusion conserves.
     """
 
     fields: Float[Array, "n V 3"]
@@ -55,32 +55,32 @@ class HarmonicFields(eqx.Module):
 
 @on_surface
 def harmonic_fields(surface: Surface) -> HarmonicFields:
-    """The tangent fields with neither divergence nor curl: two for every handle (host). Second order.
+    """The tangent fields with neither divergence nor curl, two for every handle (host): second order.
 
-    The lowest eigenvectors of the Hodge Laplacian, as of `hodge_laplacian`.
+    They are the lowest eigenvectors of the Hodge Laplacian (`hodge_laplacian`).
 
     Args:
-        surface: a closed `Monotone` surface, or one with the topology of a disk, which has none.
+        surface: closed `Monotone` surface, or one with the topology of a disk, which has no harmonic fields.
 
     Raises:
-        ValueError: the surface has a boundary and handles or several boundary loops, or is being traced.
+        ValueError: the surface has several boundary loops or both a boundary and handles, or it is being traced.
     """
     if surface.is_traced:
         raise ValueError(
-            "Harmonic fields are found on the host, but the surface is being traced by a JAX transformation. Compute "
-            "them outside and hand them to ltl.vectors.helmholtz_hodge."
+            "Harmonic fields are computed on the host, but the surface is being traced by a JAX transformation. "
+            "Compute them outside and hand them to ltl.vectors.helmholtz_hodge."
         )
-    with jax.ensure_compile_time_eval():  # inside jit too, of a surface that is not traced
+    with jax.ensure_compile_time_eval():  # A surface that is not traced has its fields inside jit as well.
         return _harmonic(surface, _number_of_handles(surface))
 
 
-def _harmonic(surface: Surface, number: int) -> HarmonicFields:
-    if number == 0:
+def _harmonic(surface: Surface, num_handles: int) -> HarmonicFields:
+    if num_handles == 0:
         return HarmonicFields(jnp.zeros((0, surface.num_vertices, 3), surface.dtype), surface.mass)
     gauss = np.asarray(curvature(surface).gauss, np.float64)
     matrix = scipy.sparse.csc_array(-connection_matrix(surface) + scipy.sparse.diags_array(gauss))
-    vectors = lowest(matrix, number, 1 / float(np.asarray(surface.vertex_areas).sum()))
-    # With a field the one turned by a right angle is harmonic too.
+    vectors = lowest(matrix, num_handles, 1 / float(np.asarray(surface.vertex_areas).sum()))
+    # A harmonic field rotated by a right angle is harmonic too.
     components = np.stack([[z.real, z.imag] for z in (*vectors, *(1j * vectors))])
     fields = np.einsum("nav,vac->nvc", components, np.asarray(surface.geometry.frames, np.float64))
     weight = np.sqrt(np.asarray(surface.mass, np.float64))[:, None]
@@ -96,23 +96,29 @@ def helmholtz_hodge(
     harmonic: HarmonicFields | None = None,
     preconditioner: Multigrid | Factorized | None = None,
 ) -> HodgeParts:
-    """A tangent field as the sum of a gradient, a rotation and a harmonic field, orthogonal to each other.
+    """The gradient, the rotation and the harmonic field that a tangent field is the sum of, orthogonal to each other.
 
-    Potential and stream function solve Poisson's equations for divergence and curl; the potential is then scaled so
-    that what is left of X is orthogonal to its gradient (a factor of one to second order), the part of the rest along
-    the harmonic fields is taken off, and what remains is the rotation. So the parts sum to X exactly and are orthogonal
-    to rounding, and second order for smooth fields. Of a field that is rough on the scale of the mesh the derivatives
-    see only a part, and what they do not see counts as rotation. On a boundary the rotation flows along it.
+    Potential and stream function solve Poisson's equation for the divergence and the curl of X. Then
+
+    1. the potential is scaled so that its gradient is orthogonal to the remainder of X (by a factor that is one to
+       second order),
+    2. the harmonic part is the projection of the remainder on the harmonic fields,
+    3. the rotation is the rest.
+
+    The parts therefore sum to X exactly, and they are orthogonal to rounding. For smooth fields they are of second
+    order. Divergence and curl see only a part of a field that is rough on the scale of the mesh, and the rest counts as
+    rotation. At a boundary the rotation flows along it.
 
     Args:
-        surface: a closed `Monotone` surface, or one with the topology of a disk.
-        X: (V, 3); the tangent part counts.
-        harmonic: what `harmonic_fields` returned for this surface, which is asked where none is given.
-        preconditioner: as of `poisson`. Where the surface is being traced this and ``harmonic`` must be handed in.
+        surface: closed `Monotone` surface, or one with the topology of a disk.
+        X: (V, 3) field, whose normal part is ignored.
+        harmonic: result of `harmonic_fields` for this surface; computed by default.
+        preconditioner: as for `poisson`. Where the surface is being traced, this and ``harmonic`` are needed.
 
     Raises:
-        SolveError: a potential was not found.
-        ValueError: X does not fit the surface, or the surface has a boundary and handles or several boundary loops.
+        SolveError: a Poisson equation was not solved.
+        ValueError: X does not fit the surface, or the surface has several boundary loops or both a boundary and
+            handles.
 
     Source: Helmholtz (1858), doi:10.1515/crll.1858.55.25; Bhatia and others (2013), The Helmholtz-Hodge decomposition:
     a survey, doi:10.1109/TVCG.2012.316.
@@ -127,7 +133,7 @@ def helmholtz_hodge(
         stream = poisson(surface, sources[:, 1], Dirichlet(0.0), preconditioner=preconditioner)
     else:
         with warnings.catch_warnings():
-            # Of a rough field these means are no derivative's.
+            # Divergence and curl of a rough field may have a mean.
             warnings.simplefilter("ignore", IncompatibleSourceWarning)
             potential, stream = poisson(surface, sources, preconditioner=preconditioner).T
     return _parts(surface, X, potential, stream, harmonic)
@@ -139,21 +145,26 @@ def _parts(surface: Surface, X: Array, potential: Array, stream: Array, harmonic
         return jnp.einsum("v,...vc,...vc->...", harmonic.measure, X, Y)
 
     slope = gradient(surface, potential)
-    size = product(slope, slope)
-    is_flat = size == 0
-    scale = jnp.where(is_flat, 0, product(slope, X) / jnp.where(is_flat, 1, size))
-    rest = X - scale * slope
-    # The basis, to second order orthogonal to the gradient, made so exactly.
-    across = product(harmonic.fields, slope[None]) / jnp.where(is_flat, 1, size)
-    fields = harmonic.fields - across[:, None, None] * slope[None]
+    square = product(slope, slope)
+    is_flat = square == 0
+    square = jnp.where(is_flat, 1, square)
+    scale = jnp.where(is_flat, 0, product(slope, X) / square)
+    remainder = X - scale * slope
+    # The harmonic fields are orthogonal to the gradient to second order. Here they are made so exactly.
+    overlap = product(harmonic.fields, slope[None]) / square
+    fields = harmonic.fields - overlap[:, None, None] * slope[None]
     gram = jax.vmap(lambda X: product(fields, X[None]))(fields)
-    shares = jnp.linalg.solve(gram, product(fields, rest[None])) if len(fields) else jnp.zeros(0, X.dtype)
-    around = jnp.einsum("n,nvc->vc", shares, fields)
-    return HodgeParts(scale * slope, rest - around, around, scale * potential, stream)
+    coefficients = jnp.linalg.solve(gram, product(fields, remainder[None])) if len(fields) else jnp.zeros(0, X.dtype)
+    projection = jnp.einsum("n,nvc->vc", coefficients, fields)
+    return HodgeParts(scale * slope, remainder - projection, projection, scale * potential, stream)
 
 
 def _number_of_handles(surface: Surface) -> int:
-    """Of all components together, which are closed or disks."""
+    """The number of handles of all components together.
+
+    Raises:
+        ValueError: a component is neither closed nor a disk.
+    """
     topology = surface.topology
     faces, components = np.asarray(topology.faces), np.asarray(topology.components)
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -161,16 +172,16 @@ def _number_of_handles(surface: Surface) -> int:
         np.bincount(part, minlength=topology.num_components)
         for part in (components, components[edges[:, 0]], components[faces[:, 0]])
     )
-    rims = np.unique(np.stack([np.asarray(topology.loops), components[np.asarray(topology.boundary)]]), axis=1)
-    loops = np.bincount(rims[1], minlength=topology.num_components)
+    loops_of = np.unique(np.stack([np.asarray(topology.loops), components[np.asarray(topology.boundary)]]), axis=1)[1]
+    loops = np.bincount(loops_of, minlength=topology.num_components)
     handles = (2 - loops - (vertices - edges_of + faces_of)) // 2
     is_bad = (loops > 1) | ((loops > 0) & (handles > 0))
     if is_bad.any():
         first = int(np.argmax(is_bad))
-        rim, handle = int(loops[first]), int(handles[first])
-        where = f" on component {first}" if topology.num_components > 1 else ""
+        num_loops, num_handles = int(loops[first]), int(handles[first])
+        place = f" on component {first}" if topology.num_components > 1 else ""
         raise ValueError(
-            f"Expected closed surfaces or disks, found {rim} boundary loop{'s' * (rim > 1)} and {handle} "
-            f"handle{'s' * (handle != 1)}{where}."
+            f"Expected closed surfaces or disks, found {num_loops} boundary loop{'s' * (num_loops > 1)} and "
+            f"{num_handles} handle{'s' * (num_handles != 1)}{place}."
         )
     return int(handles.sum())

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._equations import Equation
 from .._surface import Surface
-from .krylov import BiCGStab, Preconditioner, linear_solve, rms, unit_of
+from .krylov import BiCGStab, Jacobi, Preconditioner, linear_solve, rms, unit_of
 from .multigrid import Multigrid
 
 # Linear systems are solved to this share of the tolerance of a step, Newton's iterations to the share optimistix takes.
@@ -71,8 +71,8 @@ class Preconditioning(eqx.Module):
     def of(self, surface: Surface, alpha: Array, beta: Array) -> Preconditioner:
         """An approximate inverse of ``alpha - beta Delta``, with one alpha and one beta for every species."""
         if self.multigrid is not None:
-            return Cycle(self.multigrid, alpha, beta)
-        return Jacobi(1 / (alpha[None] - beta[None] * surface.laplacian_stencil.diagonal()[:, None]))
+            return self.multigrid.shifted(alpha, beta)
+        return Jacobi(-surface.laplacian_stencil.diagonal()[:, None]).shifted(alpha, beta)
 
     def absolute(self, unit: Array) -> Array:
         """The absolute tolerance of each species, in units of their own."""
@@ -83,29 +83,6 @@ class Preconditioning(eqx.Module):
         wanted = _SHARE * (jnp.sqrt(jnp.mean(absolute**2)) + self.rtol * rms(u))
         least, size = 20 * jnp.finfo(u.dtype).eps, rms(b)
         return jax.lax.stop_gradient(jnp.clip(wanted / jnp.where(size > 0, size, 1), least, _LOOSEST))
-
-
-class Cycle(Preconditioner):
-    """A V-cycle."""
-
-    multigrid: Multigrid
-    alpha: Float[Array, " S"]
-    beta: Float[Array, " S"]
-
-    def __call__(self, r, transposed):
-        """The V-cycle for r."""
-        return self.multigrid(self.alpha, self.beta, r.reshape(len(r), -1), transposed).reshape(r.shape)
-
-
-class Jacobi(Preconditioner):
-    """Division by the diagonal."""
-
-    inverse: Float[Array, "V S"]
-
-    def __call__(self, r, transposed):
-        """r over the diagonal."""
-        del transposed
-        return (self.inverse * r.reshape(len(r), -1)).reshape(r.shape)
 
 
 def implicit_stage(
@@ -156,7 +133,7 @@ def _stage_in_units(
     # Corrections below what the tolerance can see are none, or the last would be solved for among rounding errors.
     enough = 1e-3 * (jnp.sqrt(jnp.mean(absolute**2)) + preconditioning.rtol * rms(guess))
     enough = jax.lax.stop_gradient(jnp.asarray(enough, right.dtype))
-    solver = BiCGStab(jnp.asarray(_LOOSEST, right.dtype), preconditioner, absolute=enough)
+    solver = BiCGStab(jnp.asarray(_LOOSEST, right.dtype), preconditioner, atol=enough)
     newton = _Newton(
         jnp.asarray(preconditioning.rtol, right.dtype),
         jax.lax.stop_gradient(jnp.asarray(absolute, right.dtype)),

@@ -1,7 +1,7 @@
 """Eigenmodes of the Laplacian (host), and their eigenvalues as differentiable functions of the surface.
 
 What enters: a surface. What leaves: the lowest eigenvalues of -Delta with their modes, by shift-invert Arnoldi
-iteration for a matrix that is not symmetric.
+iteration for a nonsymmetric matrix.
 """
 
 from typing import Any
@@ -17,20 +17,21 @@ from .._equations import boundary as bounds
 from .._operators import laplacian, laplacian_matrix
 from .._surface import Surface, on_surface
 
-# Below this size all eigenvalues are computed at once.
+# Up to this size the whole spectrum of the dense matrix is computed.
 _DENSE = 300
-# How many modes beyond those asked for are computed.
-_MORE = 6
+# Number of modes that are computed beyond those asked for.
+_EXTRA = 6
 
 
 class Eigenmodes(eqx.Module):
-    """The lowest modes of -Delta: unpacks as ``values, vectors``.
+    """The lowest modes of -Delta; unpacks as ``values, vectors``.
 
     Attributes:
-        values: (k,) ascending.
-        vectors: (V, k) with ``integrate(surface, vectors[:, i] ** 2) = 1``.
-        left: (V, k) of the transposed operator, with ``left.T @ vectors`` the identity.
-        residuals: (k,) the size of ``Delta vector + value vector`` relative to that of the operator's action.
+        values: (k,) eigenvalues in ascending order.
+        vectors: (V, k) modes with ``integrate(surface, vectors[:, i] ** 2) = 1``.
+        left: (V, k) modes of the transposed operator, with ``left.T @ vectors`` the identity.
+        residuals: (k,) norms of ``Delta vector + value vector`` relative to ``value vector``, or for small eigenvalues
+            to ``vector / area``.
     """
 
     values: Float[Array, " k"]
@@ -42,10 +43,11 @@ class Eigenmodes(eqx.Module):
         return iter((self.values, self.vectors))
 
     def values_on(self, surface: Surface) -> Float[Array, " k"]:
-        """The eigenvalues as a differentiable function of the surface: exact, and with exact first derivatives, on the
-        surface of the modes; elsewhere the two-sided Rayleigh quotient, whose error is of second order in the change.
+        """The eigenvalues as a differentiable function of the surface.
 
-        Eigenvalues that are equal do not have derivatives one by one; their sum does.
+        Values and first derivatives are exact on the surface of the modes. On another surface the result is the
+        two-sided Rayleigh quotient, whose error is of second order in the change. Equal eigenvalues are not
+        differentiable one by one, but their sum is.
         """
         acted = laplacian(surface, self.vectors)
         return -jnp.sum(self.left * acted, axis=0) / jnp.sum(self.left * self.vectors, axis=0)
@@ -56,10 +58,10 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
     """The k lowest eigenvalues of -Delta and their modes (host): second order with ``Monotone``.
 
     Args:
-        surface: the surface; any scheme, though `Paper` has eigenvalues that are not the surface's.
-        k: how many; on a closed surface the first is zero.
-        boundary: `Dirichlet` or `Robin` conditions, their data taken as zero; without any the normal derivative
-            vanishes. `Eigenmodes.values_on` is for surfaces without.
+        surface: surface of any scheme. `Paper` has spurious eigenvalues.
+        k: number of modes; on a closed surface the first eigenvalue is zero.
+        boundary: `Dirichlet` or `Robin` conditions, whose data are taken as zero. By default the normal derivative
+            vanishes. `Eigenmodes.values_on` supports this default only.
 
     Raises:
         ValueError: the surface is being traced, or has too few vertices.
@@ -74,72 +76,77 @@ def eigenmodes(surface: Surface, k: int = 12, boundary: bounds.Conditions | None
         raise ValueError(f"Expected a whole number of modes, found {k!r}.")
     if not 1 <= k <= size - 2:
         raise ValueError(f"Expected a number of modes from 1 to {size - 2}, found {k}.")
+    operator, free = _free_operator(surface, boundary)
+    areas = np.asarray(surface.vertex_areas, np.float64)
+    values, right, left = _lowest(operator, k, 1 / areas.sum())
+    residuals = np.linalg.norm(operator @ right - right * values, axis=0)
+    residuals = residuals / (np.maximum(np.abs(values), 1 / areas.sum()) * np.linalg.norm(right, axis=0))
+    norms = np.sqrt((areas[free, None] * right**2).sum(axis=0))
+    # The sign of a mode makes its entry of largest magnitude positive.
+    signs = np.sign(right[np.abs(right).argmax(axis=0), np.arange(k)])
+    vectors = np.zeros((2, size, k))
+    vectors[:, free] = right / norms * signs, left * norms * signs
+    cast = lambda a: jnp.asarray(a, surface.dtype)  # noqa: E731
+    return Eigenmodes(cast(values), cast(vectors[0]), cast(vectors[1]), residuals)
+
+
+def _free_operator(surface: Surface, boundary: bounds.Conditions | None) -> tuple[scipy.sparse.csc_array, np.ndarray]:
+    """The matrix of -Delta with what conditions absorb, on the vertices that are not held, and these vertices."""
     conditions = bounds.as_tuple(boundary)
     if any(condition.species is not None for condition in conditions):
-        raise ValueError("A condition for some species belongs to a state of several; modes are of one field.")
-    zero = jnp.zeros(size, surface.dtype)
-    held = np.asarray(bounds.held_vertices(surface, conditions))
-    lost = np.asarray(bounds.absorption(surface, conditions, jnp.zeros((), surface.dtype), zero)) if conditions else 0
-    operator = -laplacian_matrix(surface).astype(np.float64) + scipy.sparse.diags_array(np.zeros(size) + lost)
-    free = np.flatnonzero(~held)
-    inner = scipy.sparse.csc_array(scipy.sparse.csr_array(operator)[free][:, free])
-    areas = np.asarray(surface.vertex_areas, np.float64)
-    values, right, left = _lowest(inner, k, 1 / areas.sum())
-    residuals = np.linalg.norm(inner @ right - right * values, axis=0)
-    residuals = residuals / (np.maximum(np.abs(values), 1 / areas.sum()) * np.linalg.norm(right, axis=0))
-    size_of = np.sqrt((areas[free, None] * right**2).sum(axis=0))
-    right, left = right / size_of, left * size_of
-    # The sign with which the largest entry is positive.
-    sign = np.sign(right[np.abs(right).argmax(axis=0), np.arange(k)])
-    spread = np.zeros((2, size, k))
-    spread[:, free] = right * sign, left * sign
-    cast = lambda a: jnp.asarray(a, surface.dtype)  # noqa: E731
-    return Eigenmodes(cast(values), cast(spread[0]), cast(spread[1]), residuals)
+        raise ValueError(
+            "A boundary condition with species=... applies to a state of several species, but a mode is one field. "
+            "Leave species out."
+        )
+    size = surface.num_vertices
+    operator = -laplacian_matrix(surface).astype(np.float64)
+    if conditions:
+        time, like = jnp.zeros((), surface.dtype), jnp.zeros(size, surface.dtype)
+        absorption = np.asarray(bounds.absorption(surface, conditions, time, like), np.float64)
+        operator = operator + scipy.sparse.diags_array(absorption)
+    free = np.flatnonzero(~np.asarray(bounds.held_vertices(surface, conditions)))
+    return scipy.sparse.csc_array(scipy.sparse.csr_array(operator)[free][:, free]), free
 
 
 def _lowest(matrix: Any, k: int, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The k eigenvalues next to zero with right and left vectors, real, biorthonormal."""
-    values: Any
-    if matrix.shape[0] <= _DENSE:
-        values, vectors = np.linalg.eig(matrix.toarray())
-        values, right = _real(values, vectors)
+    """The k eigenvalues nearest to zero with right and left vectors, real and biorthonormal."""
+    size = matrix.shape[0]
+    if size <= _DENSE:
+        values, right = _real(*np.linalg.eig(matrix.toarray()))
         return values[:k], right[:, :k], np.linalg.inv(right).T[:, :k]
     shift = -scale
-    factors = scipy.sparse.linalg.splu(
-        scipy.sparse.csc_matrix(matrix - shift * scipy.sparse.eye_array(matrix.shape[0]))
-    )
-    size = matrix.shape[0]
+    factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(matrix - shift * scipy.sparse.eye_array(size)))
     values, right, left = np.zeros(0), np.zeros((size, 0)), np.zeros((size, 0))
-    # The iteration starts from one vector. If an eigenvalue has several modes, that vector has only one combination of
-    # them, and the others appear by rounding alone. The iteration is therefore repeated on the complement of the modes
-    # found so far, until the eigenvalues of that complement are larger than the k wanted ones.
-    count = min(k + _MORE, size - 2)
+    # The iteration starts from one vector. If an eigenvalue has several modes, that vector contains only one
+    # combination of them, and the others appear by rounding alone. The iteration is therefore repeated on the
+    # complement of the modes known so far, until the eigenvalues of that complement exceed the k-th one.
+    count = min(k + _EXTRA, size - 2)
     while count > 0:
-        inverse = _Deflated(factors, shift, values, right, left)
-        further, more_right = _real(*_iterated(matrix, inverse, count, shift, "N"))
-        _, more_left = _real(*_iterated(matrix, inverse, count, shift, "T"))
-        # Each side leaves out the last one if its partner was not computed.
-        complete = min(more_right.shape[1], more_left.shape[1])
-        further, more_right, more_left = further[:complete], more_right[:, :complete], more_left[:, :complete]
-        more_left = more_left @ np.linalg.inv(more_right.T @ more_left)
-        is_missing = further < (values[k - 1] if len(values) >= k else np.inf)
-        right, left = np.hstack([right, more_right]), np.hstack([left, more_left])
-        values = np.concatenate([values, further])
+        inverse = _DeflatedInverse(factors, shift, values, right, left)
+        new_values, new_right = _real(*_arnoldi(matrix, inverse, count, shift, "N"))
+        _, new_left = _real(*_arnoldi(matrix, inverse, count, shift, "T"))
+        # Each side omits its last vector if the conjugate partner was not computed.
+        complete = min(new_right.shape[1], new_left.shape[1])
+        new_values, new_right, new_left = new_values[:complete], new_right[:, :complete], new_left[:, :complete]
+        new_left = new_left @ np.linalg.inv(new_right.T @ new_left)
+        is_lower = new_values < (values[k - 1] if len(values) >= k else np.inf)
+        values = np.concatenate([values, new_values])
         order = np.argsort(values, kind="stable")
-        values, right, left = values[order], right[:, order], left[:, order]
-        count = min(_MORE, size - len(values) - 2) if is_missing.any() else 0
+        values, right = values[order], np.hstack([right, new_right])[:, order]
+        left = np.hstack([left, new_left])[:, order]
+        count = min(_EXTRA, size - len(values) - 2) if is_lower.any() else 0
     return values[:k], right[:, :k], left[:, :k]
 
 
-class _Deflated:
-    """The inverse of a matrix less a shift, on the complement of the modes that were found.
+class _DeflatedInverse:
+    """The inverse of a matrix minus a shift, on the complement of the known modes.
 
     Args:
-        factors: the sparse LU factors of the matrix less the shift.
-        shift: what was subtracted.
-        values: (n,) found eigenvalues.
-        right: (V, n) their vectors.
-        left: (V, n) those of the transposed matrix, with ``left.T @ right`` the identity.
+        factors: sparse LU factors of the matrix minus the shift.
+        shift: number that was subtracted from the diagonal.
+        values: (n,) known eigenvalues.
+        right: (V, n) their eigenvectors.
+        left: (V, n) eigenvectors of the transposed matrix, with ``left.T @ right`` the identity.
     """
 
     def __init__(self, factors: Any, shift: float, values: np.ndarray, right: np.ndarray, left: np.ndarray):
@@ -147,14 +154,14 @@ class _Deflated:
         self.inverse = 1 / (values - shift)
 
     def __call__(self, v: np.ndarray, side: str) -> np.ndarray:
-        """The product with a vector, for the side ``"T"`` of the transposed inverse."""
+        """The product with a vector; side ``"T"`` is the product of the transposed inverse."""
         v = np.ascontiguousarray(v).ravel()
         right, left = (self.right, self.left) if side == "N" else (self.left, self.right)
         return self.factors.solve(v, trans=side) - right @ (self.inverse * (left.T @ v))
 
 
-def _iterated(matrix: Any, inverse: _Deflated, count: int, shift: float, side: str) -> Any:
-    """The eigenvalues next to the shift, and their vectors, by Arnoldi iteration."""
+def _arnoldi(matrix: Any, inverse: _DeflatedInverse, count: int, shift: float, side: str) -> Any:
+    """The eigenvalues nearest to the shift and their vectors, by Arnoldi iteration."""
     operator: Any = scipy.sparse.linalg.LinearOperator
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     options: Any = dict(
@@ -167,9 +174,9 @@ def _iterated(matrix: Any, inverse: _Deflated, count: int, shift: float, side: s
 def _real(values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
     """Real eigenvalues in ascending order, with real vectors that span the same spaces.
 
-    Discretisation can turn two real eigenvalues that nearly coincide into a complex pair. The two vectors of such a
-    pair are replaced by the real and the imaginary part of one of them. The last vector that was computed can lack its
-    partner: alone it spans no such space, and is left out.
+    Discretisation can turn two real eigenvalues that nearly coincide into a complex pair. The two vectors of a pair are
+    replaced by the real and the imaginary part of one of them. The last computed vector can lack its partner; it spans
+    no real space by itself and is omitted.
     """
     out, is_free, is_whole = vectors.real.copy(), values.imag < 0, values.imag == 0
     for i in np.flatnonzero(values.imag > 0):

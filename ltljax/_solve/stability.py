@@ -1,7 +1,7 @@
-"""Whether a uniform state is stable, and what grows out of it: Turing's analysis for any kinetics, on any surface.
+"""Whether a uniform state is stable, and which modes grow out of it: Turing's analysis for any kinetics and surface.
 
-What enters: kinetics, diffusivities, a uniform steady state; for `explain` an equation and a surface. What leaves:
-growth rates against the eigenvalues of -Delta, and in words what a run will show.
+What enters: kinetics, diffusivities and a uniform steady state; for `explain` an equation and a surface. What leaves:
+growth rates as a function of the eigenvalues of -Delta, and a text that predicts what a run will show.
 """
 
 import dataclasses
@@ -23,25 +23,25 @@ from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .modes import eigenmodes
 
-# Samples of the growth rate in which changes of sign are looked for.
+# Number of samples of the growth rate between which changes of sign are detected.
 _SAMPLES = 2000
-# Fewer edges in a wavelength than this leave an error of five percent and more in the eigenvalue.
+# With fewer edges per wavelength the error of the eigenvalue is five percent or more.
 _EDGES = 8
-# A pattern that grows so many times as fast as uniform departures is seen before them.
+# A pattern that grows this many times as fast as uniform perturbations is visible before them.
 _FASTER = 2.0
-# Growth rates of less than this share of the reaction's own rates are rounding.
+# A growth rate below this share of the reaction's own rates is rounding error.
 _ROUNDING = 1e-12
-# More modes than this are counted by Weyl's law.
+# Larger numbers of modes are estimated by Weyl's law.
 _MODES = 150
 
 
 class Dispersion(eqx.Module):
-    """The linear growth of small departures from a uniform steady state, exp(sigma t) times a mode of -Delta.
+    """The linear growth of small perturbations of a uniform steady state: exp(sigma t) times a mode of -Delta.
 
     Attributes:
-        jacobian: (S, S) of the rates at the state.
-        diffusivity: (S,).
-        steady_state: (S,).
+        jacobian: (S, S) Jacobian of the rates at the steady state.
+        diffusivity: (S,) diffusivity of each species.
+        steady_state: (S,) uniform steady state.
     """
 
     jacobian: Float[Array, "S S"]
@@ -49,9 +49,11 @@ class Dispersion(eqx.Module):
     steady_state: Float[Array, " S"]
 
     def growth(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "..."]:
-        """The growth rate: the largest real part of the eigenvalues of J - lambda D, for eigenvalues lambda of -Delta.
+        """The growth rate: the largest real part of the eigenvalues of J - lambda D at an eigenvalue lambda of -Delta.
 
-        Differentiable with respect to parameters and lambda. Source: Turing (1952), doi:10.1098/rstb.1952.0012.
+        It is differentiable in the parameters and in lambda.
+
+        Source: Turing (1952), The chemical basis of morphogenesis, doi:10.1098/rstb.1952.0012.
         """
         matrices = self._matrices(eigenvalue)
         if self.diffusivity.size > 2:
@@ -60,20 +62,23 @@ class Dispersion(eqx.Module):
             return matrices[..., 0, 0]
         half = (matrices[..., 0, 0] + matrices[..., 1, 1]) / 2
         square = ((matrices[..., 0, 0] - matrices[..., 1, 1]) / 2) ** 2 + matrices[..., 0, 1] * matrices[..., 1, 0]
-        # The root is real or imaginary; the inner choice keeps the derivative of the other one finite.
+        # The root is real or imaginary. The inner `where` keeps the derivative of the unused branch finite.
         return half + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
     def frequency(self, eigenvalue: Float[AnyArray, "..."] | float) -> Float[Array, "..."]:
-        """The angular frequency at which the mode that grows fastest oscillates: zero where it does not (host)."""
+        """The angular frequency of the fastest growing mode, zero if it does not oscillate (host)."""
         values = np.linalg.eigvals(np.asarray(self._matrices(eigenvalue)))
         leading = np.argmax(np.real(values), axis=-1, keepdims=True)
         return jnp.asarray(np.abs(np.take_along_axis(np.imag(values), leading, axis=-1))[..., 0], self.jacobian.dtype)
 
     @functools.cached_property
     def band(self) -> tuple[float, float] | None:
-        """The eigenvalues of -Delta between which modes grow, or None; infinite where no end is found (host)."""
+        """The interval of eigenvalues of -Delta at which modes grow, or None (host).
+
+        Its upper end is infinite if modes grow at all large eigenvalues.
+        """
         samples = self._samples()
-        is_growing = np.asarray(self.growth(samples)) > self._rounding
+        is_growing = np.asarray(self.growth(samples)) > self.rounding
         if not is_growing.any():
             return None
         first, last = np.flatnonzero(is_growing)[[0, -1]]
@@ -83,33 +88,36 @@ class Dispersion(eqx.Module):
 
     @functools.cached_property
     def fastest(self) -> tuple[float, float]:
-        """The eigenvalue of -Delta that grows fastest, or decays slowest, and its rate (host)."""
+        """The eigenvalue of -Delta whose mode grows fastest, or decays slowest, and its growth rate (host)."""
         samples = self._samples()
         best = int(np.argmax(self.growth(samples)))
         ends = samples[max(best - 1, 0)], samples[min(best + 1, len(samples) - 1)]
-        found: Any = scipy.optimize.minimize_scalar(lambda x: -float(self.growth(x)), bounds=ends, method="bounded")
-        at = max((float(found.x), float(samples[best])), key=lambda x: float(self.growth(x)))
-        return at, float(self.growth(at))
+        result: Any = scipy.optimize.minimize_scalar(lambda x: -float(self.growth(x)), bounds=ends, method="bounded")
+        eigenvalue = max((float(result.x), float(samples[best])), key=lambda x: float(self.growth(x)))
+        return eigenvalue, float(self.growth(eigenvalue))
 
     @property
     def wavelength(self) -> float:
-        """2 pi / sqrt(lambda) of the mode that grows fastest; infinite where that is the uniform one (host)."""
-        at, _ = self.fastest
-        return 2 * np.pi / np.sqrt(at) if at > 0 else float("inf")
+        """2 pi / sqrt(lambda) of the fastest growing mode, infinite if that mode is uniform (host)."""
+        eigenvalue, _ = self.fastest
+        return 2 * np.pi / np.sqrt(eigenvalue) if eigenvalue > 0 else float("inf")
 
     @property
     def forms_pattern(self) -> bool:
-        """Whether the uniform state is stable by itself and diffusion makes stationary modes grow fastest: Turing's
-        instability (host)."""
-        return self.band is not None and float(self.growth(0.0)) <= self._rounding and not self.makes_waves
+        """Whether this is a Turing instability (host).
+
+        The uniform state is then stable without diffusion, and with diffusion a stationary mode grows fastest.
+        """
+        return self.band is not None and float(self.growth(0.0)) <= self.rounding and not self.makes_waves
 
     @property
     def makes_waves(self) -> bool:
-        """Whether the mode that grows fastest, or decays slowest, oscillates as it does (host)."""
-        return float(self.frequency(self.fastest[0])) > self._rounding
+        """Whether the mode that grows fastest, or decays slowest, oscillates (host)."""
+        return float(self.frequency(self.fastest[0])) > self.rounding
 
     @property
-    def _rounding(self) -> float:
+    def rounding(self) -> float:
+        """The growth rate up to which a mode counts as neutral, because rounding can cause it (host)."""
         rounding = max(_ROUNDING, 8 * float(jnp.finfo(self.jacobian.dtype).eps))
         return rounding * float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
 
@@ -121,13 +129,13 @@ class Dispersion(eqx.Module):
     def _samples(self) -> np.ndarray:
         diffusivity, size = np.asarray(self.diffusivity), float(np.abs(np.asarray(self.jacobian)).sum(axis=1).max())
         moving = diffusivity[diffusivity > 0]
-        # Beyond the first no mode can grow, by Gershgorin's theorem, if every species diffuses.
+        # By Gershgorin's theorem no mode grows beyond `largest` if every species diffuses.
         largest = size / moving.min() if len(moving) else 1.0
         return np.concatenate([[0.0], np.geomspace(1e-7 * largest, 1.01 * largest, _SAMPLES)])
 
     def _root(self, low: Any, high: Any) -> float:
-        found: Any = scipy.optimize.brentq(lambda x: float(self.growth(x)) - self._rounding, low, high)
-        return float(found)
+        root: Any = scipy.optimize.brentq(lambda x: float(self.growth(x)) - self.rounding, low, high)
+        return float(root)
 
 
 def dispersion(
@@ -135,15 +143,16 @@ def dispersion(
     diffusivity: Float[AnyArray, " S"] | Sequence[float],
     steady_state: Float[AnyArray, " S"] | Sequence[float] | None = None,
 ) -> Dispersion:
-    """How small departures from a uniform steady state grow, by the Jacobian of the rates there.
+    """The growth rates of small perturbations of a uniform steady state, from the Jacobian of the rates there.
 
     Args:
-        kinetics: the reaction; parameters that are fields count with their mean.
-        diffusivity: one number for each species.
-        steady_state: a guess, from which the state is found by Newton's method; by default the closed form.
+        kinetics: the reaction. A parameter that is a field counts with its mean.
+        diffusivity: (S,) diffusivity of each species.
+        steady_state: (S,) guess from which Newton's method finds the steady state; by default the closed form.
 
     Raises:
-        ValueError: no steady state is known, or none is near the one given, or shapes do not fit.
+        ValueError: no closed form of the steady state is known, Newton's method finds none near the guess, or shapes
+            do not match.
     """
     mean = jax.tree.map(lambda p: jnp.mean(jnp.asarray(p, jnp.result_type(float))), kinetics.params)
     local = Kinetics(kinetics.rates, mean)
@@ -159,27 +168,30 @@ def dispersion(
 
 
 def _polished(rates, guess) -> Array:
-    """The steady state next to a guess, with the derivatives that the implicit function has."""
+    """The steady state near a guess, with the derivatives of the implicit function theorem."""
     state = jnp.asarray(guess, jnp.result_type(float))
     for _ in range(20):
         state = state - jnp.linalg.solve(jax.jacfwd(rates)(state), rates(state))
     residual = rates(state)
     if not isinstance(residual, Tracer) and not bool(jnp.max(jnp.abs(residual)) < 1e-4):
-        raise ValueError(f"No steady state was found near {guess}: Newton's method ends with rates {residual}.")
+        raise ValueError(
+            f"Newton's method found no steady state near {guess}: the rates at its last iterate are {residual}. Give a "
+            "guess closer to the steady state."
+        )
     return state
 
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """What linear theory says of a run before it starts; prints as text.
+    """What linear theory predicts for a run; prints as text.
 
     Attributes:
-        forms_pattern: whether a stationary pattern grows out of the uniform state on this surface; waves are none.
-        dispersion: the growth rates.
-        num_modes: how many modes of the surface grow.
-        wavelength: of the mode that grows fastest; infinite where none does.
-        edges_per_wavelength: the wavelength in mean edge lengths of the mesh.
-        message: all of it in words.
+        forms_pattern: whether a stationary pattern (not waves) grows out of the uniform state on this surface.
+        dispersion: growth rates.
+        num_modes: number of modes of the surface that grow.
+        wavelength: wavelength of the fastest growing mode, infinite if none grows.
+        edges_per_wavelength: wavelength in mean edge lengths of the mesh.
+        message: the prediction in words.
     """
 
     forms_pattern: bool
@@ -199,96 +211,119 @@ def explain(
     surface: Surface,
     steady_state: Float[AnyArray, " S"] | Sequence[float] | None = None,
 ) -> Explanation:
-    """Whether a pattern can form on a surface, of what wavelength, and whether the mesh resolves it (host).
+    """Whether a pattern can form on a surface, its wavelength, and whether the mesh resolves it (host).
 
-    Linear theory of small departures from the uniform steady state. What a finite push does to a state that is stable
-    (spots of Gray and Scott, waves of Barkley) it cannot tell, and says so.
+    This is linear theory of small perturbations of the uniform steady state. It cannot predict what a large
+    perturbation does to a stable state (the spots of Gray and Scott, the waves of Barkley), and the text says so.
 
     Args:
-        equation: the equation; diffusivities that vary count with their mean.
-        surface: the surface. Its modes are computed where they are few, and counted by Weyl's law where they are many.
-        steady_state: as of `dispersion`.
+        equation: the equation. A diffusivity that varies counts with its mean.
+        surface: the surface. Its modes are computed if they are few and estimated by Weyl's law if they are many.
+        steady_state: guess of the steady state, as for `dispersion`.
     """
-    found = dispersion(equation.reaction, _mean_diffusivities(equation, surface), steady_state)
-    state = ", ".join(f"{x:.4g}" for x in np.asarray(found.steady_state))
-    band, (fastest, rate) = found.band, found.fastest
-    alone = float(found.growth(0.0))
-    outgrown = alone > found._rounding and fastest > 0 and rate > _FASTER * alone and not found.makes_waves
-    if alone > found._rounding and not outgrown:
-        reason = f"The uniform state ({state}) is unstable without diffusion already, at the rate {alone:.3g}"
-        message = f"{reason}: it is left everywhere at once, by oscillation or for another state."
-        return Explanation(False, found, 0, float("inf"), float("inf"), message)
-    if alone >= -found._rounding and band is None:
-        turning = float(found.frequency(0.0))
-        how = f"turn about it in the time {2 * np.pi / turning:.4g} and " if turning > found._rounding else ""
+    diffusivity = equation.diffusivities(jnp.zeros((surface.num_vertices, equation.num_species), surface.dtype))
+    growth = dispersion(equation.reaction, diffusivity, steady_state)
+    uniform_rate, (_, rate) = float(growth.growth(0.0)), growth.fastest
+    if uniform_rate > growth.rounding and not _outgrows_uniform_perturbations(growth):
+        message = _unstable_message(growth, uniform_rate)
+    elif uniform_rate >= -growth.rounding and growth.band is None:
+        message = _neutral_message(growth)
+    elif growth.band is None or rate <= 0:
         message = (
-            f"No pattern: the uniform state ({state}) is neutral. Small departures that are uniform {how}neither grow "
-            "nor decay, and none that varies over the surface grows. What larger ones do linear theory cannot tell."
+            f"No pattern: every small perturbation of the uniform state {_state(growth)} decays, the slowest at the "
+            f"rate {-rate:.3g}. {_required_ratio(growth)}A finite push may still start something."
         )
-        return Explanation(False, found, 0, float("inf"), float("inf"), message)
-    if band is None or rate <= 0:
-        message = (
-            f"No pattern: every small departure from the uniform state ({state}) decays, the slowest at the rate "
-            f"{-rate:.3g}. {_remedy(found)}A finite push may still start something."
-        )
-        return Explanation(False, found, 0, float("inf"), float("inf"), message)
-    count, known = _count_modes(surface, band)
-    wavelength, edge = found.wavelength, float(surface.mesh_size)
-    edges = wavelength / edge
-    shape = (
+    else:
+        return _explain_growth(growth, growth.band, surface)
+    return Explanation(False, growth, 0, float("inf"), float("inf"), message)
+
+
+def _state(growth: Dispersion) -> str:
+    return f"({', '.join(f'{x:.4g}' for x in np.asarray(growth.steady_state))})"
+
+
+def _outgrows_uniform_perturbations(growth: Dispersion) -> bool:
+    """Whether a stationary mode grows so fast that its pattern is visible before the uniform state is left."""
+    eigenvalue, rate = growth.fastest
+    return eigenvalue > 0 and rate > _FASTER * float(growth.growth(0.0)) and not growth.makes_waves
+
+
+def _unstable_message(growth: Dispersion, uniform_rate: float) -> str:
+    return (
+        f"The uniform state {_state(growth)} is unstable without diffusion, at the rate {uniform_rate:.3g}: it changes "
+        "everywhere at the same time, by oscillation or towards another state."
+    )
+
+
+def _neutral_message(growth: Dispersion) -> str:
+    frequency = float(growth.frequency(0.0))
+    oscillation = f"oscillate in the time {2 * np.pi / frequency:.4g} and " if frequency > growth.rounding else ""
+    return (
+        f"No pattern: the uniform state {_state(growth)} is neutral. Small uniform perturbations {oscillation}neither "
+        "grow nor decay, and no perturbation that varies over the surface grows. Linear theory does not predict the "
+        "effect of larger ones."
+    )
+
+
+def _explain_growth(growth: Dispersion, band: tuple[float, float], surface: Surface) -> Explanation:
+    """The explanation of modes that grow: which, how many on this surface, and whether the mesh resolves them."""
+    (eigenvalue, rate), wavelength = growth.fastest, growth.wavelength
+    edges = wavelength / float(surface.mesh_size)
+    count, is_exact = _count_modes(surface, band)
+    modes = (
         f"modes with eigenvalues of -Delta from {band[0]:.4g} to {band[1]:.4g} grow out of the uniform state "
-        f"({state}), fastest at {fastest:.4g} (rate {rate:.3g}, wavelength {wavelength:.4g})"
+        f"{_state(growth)}, fastest at {eigenvalue:.4g} (rate {rate:.3g}, wavelength {wavelength:.4g})"
     )
     if count == 0:
-        message = f"No pattern: {shape}, but this surface has no such mode: it is too small for the wavelength."
-        return Explanation(False, found, 0, wavelength, edges, message)
-    waves = found.makes_waves
-    if waves:
-        begins = f"Waves, and no stationary pattern, form (period {2 * np.pi / float(found.frequency(fastest)):.4g})"
+        message = f"No pattern: {modes}, but this surface has no such mode: it is too small for the wavelength."
+        return Explanation(False, growth, 0, wavelength, edges, message)
+    is_wave = growth.makes_waves
+    if is_wave:
+        period = 2 * np.pi / float(growth.frequency(eigenvalue))
+        result, subject = f"Waves, and no stationary pattern, form (period {period:.4g})", "the waves"
     else:
-        begins = "A pattern forms"
+        result, subject = "A pattern forms", "the pattern"
+    uniform_rate = float(growth.growth(0.0))
+    if uniform_rate > growth.rounding:
+        modes += f"; uniform perturbations grow too, but more slowly (rate {uniform_rate:.3g})"
     if edges >= _EDGES:
-        seen = f"resolves {'them' if waves else 'the pattern'}, with {edges:.0f} edges in a wavelength."
+        resolution = f"resolves {subject}, with {edges:.0f} edges per wavelength."
     else:
-        seen = (
-            f"does not resolve {'them' if waves else 'it'}: {edges:.1f} edges in a wavelength, {_EDGES} are wanted. "
-            "Refine the mesh or enlarge the diffusivities."
+        resolution = (
+            f"does not resolve {subject}: it has {edges:.1f} edges per wavelength, and {_EDGES} are needed. Refine the "
+            "mesh or increase the diffusivities."
         )
-    if outgrown:
-        shape += f"; without them it would be left more slowly, everywhere at once (rate {alone:.3g})"
-    message = f"{begins}: {shape}. This surface has {'' if known else 'about '}{count} such modes. The mesh {seen}"
-    return Explanation(not waves, found, count, wavelength, edges, message)
+    number = f"{'' if is_exact else 'about '}{count}"
+    message = f"{result}: {modes}. This surface has {number} such modes. The mesh {resolution}"
+    return Explanation(not is_wave, growth, count, wavelength, edges, message)
 
 
-def _mean_diffusivities(equation: ReactionDiffusion, surface: Surface) -> Array:
-    return equation.diffusivities(jnp.zeros((surface.num_vertices, equation.num_species), surface.dtype))
-
-
-def _remedy(found: Dispersion) -> str:
-    """The ratio of diffusivities beyond which two species make a pattern, as a sentence."""
-    if found.diffusivity.size != 2:
+def _required_ratio(growth: Dispersion) -> str:
+    """A sentence with the ratio of diffusivities above which two species form a pattern."""
+    if growth.diffusivity.size != 2:
         return ""
-    (a, b), (c, d) = np.asarray(found.jacobian)
+    (a, b), (c, d) = np.asarray(growth.jacobian)
     if a + d > 0 or a * d - b * c <= 0:
         return ""
     if max(a, d) <= 0:
         return "Neither species promotes itself there, so no diffusivities would make one. "
-    slow, promotes = ("first", a) if a > 0 else ("second", d)
-    ratio = ((np.sqrt(a * d - b * c) + np.sqrt(-b * c)) / promotes) ** 2
-    actual = found.diffusivity[1] / found.diffusivity[0] if a > 0 else found.diffusivity[0] / found.diffusivity[1]
+    activator, self_rate = ("first", a) if a > 0 else ("second", d)
+    ratio = ((np.sqrt(a * d - b * c) + np.sqrt(-b * c)) / self_rate) ** 2
+    first, second = growth.diffusivity
+    actual = float(second / first if a > 0 else first / second)
     return (
-        f"The {slow} species promotes itself: a pattern needs the other one to diffuse more than {ratio:.4g} times as "
-        f"fast, and it diffuses {float(actual):.4g} times as fast. "
+        f"The {activator} species promotes itself: a pattern needs the other species to diffuse more than {ratio:.4g} "
+        f"times as fast, and it diffuses {actual:.4g} times as fast. "
     )
 
 
 def _count_modes(surface: Surface, band: tuple[float, float]) -> tuple[int, bool]:
-    """How many modes of the surface grow, and whether they were computed rather than estimated."""
+    """The number of modes of the surface with eigenvalues in a band, and whether it is exact rather than estimated."""
     low, high = band
     area = float(np.asarray(surface.vertex_areas, np.float64).sum())
     estimate = area * (high - low) / (4 * np.pi)
-    wanted = int(1.3 * area * high / (4 * np.pi)) + 12 if np.isfinite(high) else _MODES + 1
-    if wanted > min(_MODES, surface.num_vertices - 2):
+    needed = int(1.3 * area * high / (4 * np.pi)) + 12 if np.isfinite(high) else _MODES + 1
+    if needed > min(_MODES, surface.num_vertices - 2):
         return round(min(estimate, surface.num_vertices)), False
-    values = np.asarray(eigenmodes(surface, wanted).values)
+    values = np.asarray(eigenmodes(surface, needed).values)
     return int(((values > low) & (values < high)).sum()), True

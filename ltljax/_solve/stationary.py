@@ -1,265 +1,55 @@
-"""Stationary states: the Poisson and the screened Poisson equation, and where the rate of an equation vanishes.
+"""Stationary states: where the rate of an equation vanishes.
 
-What enters: a surface, and a right side or an equation with a first state. What leaves: fields, with derivatives by the
-implicit function theorem.
+What enters: an equation, a surface and a state to start from. What leaves: the stationary state, with derivatives by
+the implicit function theorem.
 """
 
-import contextlib
 import warnings
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._equations import Diffusion, Equation, ReactionDiffusion, boundary as bounds
-from .._equations.spreads import are_numbers, spread_bound
-from .._lifting.schemes import Monotone, Paper, Polynomial
-from .._operators import spectral_bound
+from .._base.deprecated import renamed_arguments
+from .._equations import Diffusion, Equation, boundary as bounds
+from .._lifting.schemes import Monotone
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks
-from .direct import Factorized, factor
-from .evolve import SolveError, Steady, hierarchy, solve, what_is_fixed
-from .implicit import Preconditioning
-from .krylov import GMRES, linear_solve, rms, unit_of
+from .direct import Factorized
+from .elliptic import (
+    INCOMPATIBLE,
+    IncompatibleSourceWarning,
+    approximate_inverse,
+    component_means,
+    excess_mean,
+    is_multiple_of_laplacian,
+    raise_unless_converged,
+    stationary_diffusion,
+)
+from .evolve import SolveError, Steady, solve
+from .krylov import GMRES, Preconditioner, rms
 from .multigrid import Multigrid
 
-# A right side whose mean is more than this share of its size was not meant to have none; nor one that has more than
-# discretisation leaves of a mean that is none, which is at most this much over the number of vertices: 0.1 of it for
-# harmonics of low degree on random points, 0.6 for waves eight vertices long, and less on better meshes.
-_INCOMPATIBLE = 1e-2
-_DISCRETE = 4 * np.pi
-_MAX_MARCH = 500
+_MAX_STEPS = 500
 _MAX_NEWTON = 5
+# A state that has grown by this factor will not become stationary.
 _GROWN = 1e6
-# Vertices up to which elimination is faster than iteration, on CPU: benchmarks/direct.md for `Monotone`. Factors of
-# `Polynomial` have four times the entries and take four times as long to make; the matrix of `Paper` may be singular
-# beyond constants.
-_FACTORISED = {Monotone: 50_000, Polynomial: 20_000, Paper: 0}
-# Of the steps in time towards a stationary state, in units of the reaction's time.
+# Longest time step of the continuation, in units of the reaction's time scale.
 _LONGEST = 1e4
-# And of the stiffness, where there is hardly a reaction.
+# Slowest reaction that sets this time scale, relative to the stiffness of the whole rate.
 _SLOWEST = 1e-10
 
-
-class IncompatibleSourceWarning(UserWarning):
-    """The right side of a Poisson equation has a mean, so that there is no solution."""
+Rate = Callable[[Array], Array]
 
 
-@on_surface
-def poisson(
-    surface: Surface,
-    f: Float[AnyArray, "V *S"],
-    boundary: bounds.Conditions | None = None,
-    *,
-    tolerance: float | None = None,
-    preconditioner: Multigrid | Factorized | None = None,
-    throw: bool = True,
-) -> Float[Array, "V *S"]:
-    """The solution of Delta u = f: second order with ``Monotone``, fourth with ``Polynomial(degree=4)``.
-
-    Where nothing on a connected component holds or absorbs u, a solution exists only for an f without mean (in
-    ``surface.mass``), and then up to a constant: the mean of f over the component is taken off, which is said if it is
-    more than discretisation makes of none (``4 pi`` over the number of vertices, of the size of f, or a hundredth), and
-    the u whose mean (in the vertex areas) is zero is returned.
-
-    On CPU and up to 50,000 vertices (of ``Polynomial`` 20,000) by a factor of the matrix, made once for a surface
-    (`factorized`); programs that ask it are not kept in JAX's persistent compilation cache. Otherwise by Krylov
-    iteration (BiCGStab; with other schemes than ``Monotone`` then GMRES, where that fails) preconditioned by multigrid
-    (the extra `amg`; without it by Jacobi's method, which takes many more iterations). Differentiable in f, the data of
-    the conditions and, with a ``preconditioner``, the vertices.
-
-    Args:
-        surface: the surface.
-        f: (V,) or (V, S).
-        boundary: `Neumann`, `Dirichlet` or `Robin`, or several; without any the normal derivative vanishes.
-        tolerance: of the residual, relative to f; by default 1e-10 for float64 and 1e-5 for float32.
-        preconditioner: what `multigrid` or `factorized` returned for this surface or a similar one, where the surface
-            is being traced.
-        throw: whether to raise when the iteration does not converge. Inside jit nothing can be raised.
-
-    Raises:
-        SolveError: the iteration did not converge.
-        ValueError: f does not fit the surface or is not finite.
-
-    Warns:
-        IncompatibleSourceWarning: f has a mean where it must have none.
-    """
-    return _elliptic(surface, f, 0.0, boundary, tolerance, preconditioner, throw)
-
-
-@on_surface
-def screened_poisson(
-    surface: Surface,
-    f: Float[AnyArray, "V *S"],
-    screening: Float[AnyArray, "*V"] | float = 1.0,
-    boundary: bounds.Conditions | None = None,
-    *,
-    tolerance: float | None = None,
-    preconditioner: Multigrid | Factorized | None = None,
-    throw: bool = True,
-) -> Float[Array, "V *S"]:
-    """The solution of Delta u - c u = f for a screening c > 0, a number or (V,): see `poisson`."""
-    if not isinstance(screening, Tracer) and not (np.asarray(screening) > 0).all():
-        raise ValueError(
-            f"Expected a positive screening, found {np.asarray(screening).min()}; for none use ltl.poisson."
-        )
-    return _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw)
-
-
-def _elliptic(surface, f, screening, boundary, tolerance, preconditioner, throw):
-    f = checks.field(surface, f, "the right side")
-    if not isinstance(f, Tracer) and not np.isfinite(np.asarray(f)).all():
-        raise ValueError(f"The right side is not finite at vertex {np.argwhere(~np.isfinite(np.asarray(f)))[0][0]}.")
-    if jnp.shape(screening) not in ((), f.shape[:1]):
-        raise ValueError(
-            f"Expected a screening that is a number or of shape {f.shape[:1]}, found {jnp.shape(screening)}."
-        )
-    equation = Diffusion(1.0, source=-f, boundary=() if boundary is None else boundary)
-    if not _is_plain(equation, f):
-        raise ValueError(
-            "A condition for some species only belongs to a state of several species. The columns of a right side are "
-            "systems of their own: solve for each of them by itself."
-        )
-    preconditioner = _inverse(equation, surface, f, screening) if preconditioner is None else preconditioner
-    tolerance = (1e-10 if f.dtype == jnp.float64 else 1e-5) if tolerance is None else tolerance
-    screening = jnp.broadcast_to(jnp.asarray(screening, f.dtype), f.shape[:1])
-    start = jnp.zeros_like(f)
-    time = jnp.zeros((), f.dtype)
-    u, mean, size, converged, steps = _stationary(equation, surface, start, time, screening, preconditioner, tolerance)
-    if not isinstance(u, Tracer):
-        if said := _incompatible(surface, -mean, size):
-            warnings.warn(
-                f"The right side, fluxes included, has {said[0]} where nothing holds u, so that no solution exists. "
-                "The equation was solved for the right side without its mean.",
-                IncompatibleSourceWarning,
-                stacklevel=3,
-            )
-        if throw and not bool(converged):
-            raise SolveError(_unconverged(int(steps), preconditioner))
-    return u
-
-
-def _is_plain(equation: Diffusion, u: Array) -> bool:
-    """Whether diffusion is a multiple of the Laplacian for every species, with the same conditions for all."""
-    same = all(condition.species is None for condition in equation.conditions)
-    return same and are_numbers(equation.diffusivity, u)
-
-
-def _inverse(equation: Diffusion, surface: Surface, f: Array, screening: Any) -> Multigrid | Factorized | None:
-    """A factor of a small system on CPU, else multigrid."""
-    is_small = surface.num_vertices <= _FACTORISED[type(surface.scheme)] and jax.default_backend() == "cpu"
-    fixed = None
-    if is_small and not surface.is_traced and not isinstance(screening, Tracer):
-        fixed = what_is_fixed(equation, surface, f, 0.0)
-    if fixed is not None:
-        absorption, is_held = fixed
-        # One that is singular may still be solved by iteration.
-        with contextlib.suppress(RuntimeError):
-            return factor(surface, np.asarray(screening, np.float64) + absorption, is_held)
-    return hierarchy(equation, surface, f, 0.0)
-
-
-def _incompatible(surface: Surface, mean: Array, size: Array) -> tuple[str, float] | None:
-    """The largest of the means (one for each component and column) that are more than discretisation leaves, in words,
-    and as a share of what has it; None if there is none."""
-    components = np.asarray(surface.topology.components)
-    means, sizes = (np.asarray(a, np.float64).reshape(surface.topology.num_components, -1) for a in (mean, size))
-    least = np.minimum(_DISCRETE / np.bincount(components), _INCOMPATIBLE)
-    share = np.abs(means) / np.maximum(sizes, np.finfo(np.float64).tiny)
-    component, column = np.unravel_index(np.argmax(share / least[:, None]), share.shape)
-    at = (component, column)
-    if not share[at] > least[component]:
-        return None
-    where = f" over component {component}" * (len(means) > 1) + f" in column {column}" * (means.shape[1] > 1)
-    said = f"a mean of {means[at]:.3g}{where} (its root mean square there is {sizes[at]:.3g})"
-    return said, float(share[at])
-
-
-def _unconverged(steps: int, preconditioner: Multigrid | Factorized | None) -> str:
-    if preconditioner is None:
-        cure = 'Install the extra "amg" for multigrid'
-    elif isinstance(preconditioner, Factorized):
-        cure = "Hand in the factor of this system, raise the tolerance, or use float64"
-    else:
-        cure = "Raise the tolerance, or use float64"
-    return f"The linear system was not solved within {steps} iterations. {cure}."
-
-
-@eqx.filter_jit
-def _stationary(
-    equation: Diffusion, surface: Surface, start: Array, time: Array, screening: Array,
-    inverse: Multigrid | Factorized | None, tolerance: Any,
-) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
-    """The u with ``rate(u) = screening u``, the means taken off and the size of what has them (sources and fluxes) for
-    every component and column, whether it was found, and in how many iterations."""
-    start = equation.held(time, surface, start)
-    trailing = (1,) * (start.ndim - 1)
-    is_held = bounds.held_vertices(surface, equation.conditions)
-    lost = bounds.absorption(surface, equation.conditions, time, start) + screening
-    fixes = jnp.where(is_held, 1.0, jnp.abs(lost))
-    diffusivities = equation.diffusivities(start)
-    scale = 1.0 if inverse is None else inverse.smallest
-
-    def rate(u):
-        return equation.rate(time, surface, u) - jnp.where(is_held, 0, screening).reshape(-1, *trailing) * u
-
-    # Constants on a component where nothing fixes u are moved to the smallest eigenvalue. The solution then has the
-    # mean that a compatible right side would not give it: with m^T L = 0, scale * mean = m^T f / |m|.
-    is_free = _over_components(surface, fixes, jax.ops.segment_max) <= 0
-
-    def means(u):
-        areas = surface.vertex_areas.reshape(-1, *trailing)
-        total = _over_components(surface, surface.vertex_areas)
-        mean = _over_components(surface, areas * u) / total.reshape(-1, *trailing)
-        return jnp.where(is_free.reshape(-1, *trailing), mean, 0)
-
-    def spread(means):
-        return means[surface.topology.components] * scale * diffusivities[None]
-
-    value, derivative = jax.linearize(rate, start)
-
-    def apply(change):
-        return spread(means(change)) - derivative(change) + jnp.where(is_held.reshape(-1, *trailing), change, 0)
-
-    right = jnp.where(is_held.reshape(-1, *trailing), 0, value)
-    flat = diffusivities.reshape(-1) if trailing else diffusivities[None]
-    alpha = jnp.broadcast_to(jnp.mean(screening), flat.shape)
-    is_factor = isinstance(inverse, Factorized)
-    preconditioner = inverse if is_factor else Preconditioning(inverse).of(surface, alpha, flat)
-    # Of high order the operator may be far from the one that preconditions it.
-    persists = not isinstance(surface.scheme, Monotone)
-    most = 200 if inverse is not None else 20_000
-    found = linear_solve(apply, right, preconditioner, tolerance, most, persists=persists)
-    constants = means(found.value)
-    u = start + found.value - jnp.where(
-        is_held.reshape(-1, *trailing), 0, constants[surface.topology.components]
-    )  # fmt: skip
-    load = rate(equation.held(time, surface, jnp.zeros_like(start)))
-    # With what rounding and an unfinished iteration leave of a mean that is none.
-    rounding = (1e3 * jnp.finfo(start.dtype).eps + tolerance) / _INCOMPATIBLE
-    number = _over_components(surface, jnp.ones_like(surface.vertex_areas)).reshape(-1, *trailing)
-    unit = unit_of(jnp.max(jnp.abs(load)))
-    size = unit * jnp.sqrt(_over_components(surface, (load / unit) ** 2) / number) + rounding * rms(value)
-    return (
-        u,
-        constants * scale * diffusivities[None],
-        size,
-        found.result == lx.RESULTS.successful,
-        found.stats["num_steps"],
-    )
-
-
-def _over_components(surface: Surface, values: Array, reduce=jax.ops.segment_sum) -> Array:
-    return reduce(values, surface.topology.components, num_segments=surface.topology.num_components)
-
-
+@renamed_arguments(tolerance="rtol")
 @on_surface
 def steady_state(
     equation: Equation,
@@ -268,182 +58,215 @@ def steady_state(
     method: Literal["newton", "marching"] = "newton",
     *,
     t: float = 0.0,
-    tolerance: float = 1e-8,
+    rtol: float = 1e-8,
     t1: float = 1e4,
     preconditioner: Multigrid | Factorized | None = None,
     throw: bool = True,
 ) -> Float[Array, "V *S"]:
     """A state at which the rate of an equation vanishes.
 
-    `Diffusion` with numbers as diffusivities, and conditions for all species, is one linear system, solved to rounding
-    whatever the tolerance; where it conserves mass (nothing holds or absorbs), the state has the mass of u0.
-    Of any other equation ``"newton"`` finds a state near where u0 would go, by backward Euler steps that grow as the
-    rate falls and end as Newton's (pseudo-transient continuation); ``"marching"`` lets time run with `solve` until the
-    state is steady, then takes Newton's last step (for `Diffusion` the linear system). Differentiable in reverse and
-    forward mode by the implicit function theorem, in everything but u0. With a diffusivity that varies and no condition
-    that holds or absorbs, the state is fixed only up to a constant that u0 sets, and has no derivatives.
+    `Diffusion` with numbers as diffusivities and the same conditions for all species is one linear system, which is
+    solved to rounding for every ``rtol``. Where nothing holds or absorbs u, the state has the mass of u0.
+
+    For any other equation, ``"newton"`` finds a state near the one that u0 evolves to: by backward Euler steps that
+    grow as the rate falls and end as Newton's method (pseudo-transient continuation). ``"marching"`` integrates in time
+    with `solve` until the state is steady and then takes the last step of Newton's method, or solves the linear system
+    of `Diffusion`.
+
+    The state is differentiable in both modes by the implicit function theorem, in everything but u0. With a diffusivity
+    that varies and no condition that holds or absorbs, the state is determined up to a constant that u0 sets, and it
+    has no derivatives.
 
     Args:
         equation: the equation.
         surface: the surface.
-        u0: where to start.
+        u0: (V,) or (V, S) initial state.
         method: ``"newton"`` or ``"marching"``.
-        t: the time at which sources and boundary data are taken.
-        tolerance: of the root mean square of the rate, relative to that of the state, per unit of time.
-        t1: of ``"marching"``, the time not to run beyond.
-        preconditioner: what `multigrid` (or, for `Diffusion`, `factorized`) returned for this surface or a similar one,
-            where the surface is being traced.
-        throw: whether to raise when no such state is found. Inside jit nothing can be raised.
+        t: time at which sources and boundary data are evaluated.
+        rtol: largest root mean square of the rate relative to that of the state, per unit of time.
+        t1: longest time that ``"marching"`` integrates over.
+        preconditioner: result of `multigrid` (or, for `Diffusion`, of `factorized`) for this surface or a similar one.
+            It is needed where the surface is being traced.
+        throw: whether to raise if no such state is found. Nothing is raised inside jit.
 
     Raises:
         SolveError: no stationary state was found, or there is none.
 
     Warns:
-        IncompatibleSourceWarning: of `Diffusion`, source and fluxes have a small mean where they must have none.
+        IncompatibleSourceWarning: source and fluxes of `Diffusion` have a small mean where they must have none.
 
     Source: Kelley and Keyes (1998), Convergence analysis of pseudo-transient continuation,
     doi:10.1137/S0036142996304796.
     """
     u0 = checks.field(surface, u0, "u0")
     checks.finite(equation, u0)
-    is_one_system = isinstance(equation, Diffusion) and _is_plain(equation, u0)
-    if isinstance(preconditioner, Factorized) and not is_one_system:
+    is_linear = isinstance(equation, Diffusion) and is_multiple_of_laplacian(equation, u0)
+    if isinstance(preconditioner, Factorized) and not is_linear:
         raise ValueError(
-            f"A factor is that of one linear system, but this {type(equation).__name__} has many. Hand in "
-            "ltl.solvers.multigrid(surface) as preconditioner."
+            f"The result of ltl.solvers.factorized solves one linear system, but this {type(equation).__name__} has "
+            "many. Hand in ltl.solvers.multigrid(surface) as preconditioner."
         )
-    if not tolerance > 0 or not t1 > 0:
-        raise ValueError(f"Expected a positive tolerance and a positive t1, found {tolerance} and {t1}.")
+    if not rtol > 0 or not t1 > 0:
+        raise ValueError(f"Expected a positive rtol and a positive t1, found {rtol} and {t1}.")
     if method not in ("newton", "marching"):
         raise ValueError(f'Expected the method "newton" or "marching", found {method!r}.')
-    preconditioner = hierarchy(equation, surface, u0, t) if preconditioner is None else preconditioner
+    inverse = approximate_inverse(equation, surface, u0, t) if preconditioner is None else preconditioner
     time = jnp.asarray(t, surface.dtype)
-    first = u0
+    start = u0
     if method == "marching":
-        stopping = Steady(min(1e-4, 1e3 * tolerance))
-        # The way there has no part in the derivative, and forward mode would not go through it.
-        numbers, rest = eqx.partition((equation, surface, u0), eqx.is_inexact_array)
-        still, where, u0 = eqx.combine(jax.lax.stop_gradient(numbers), rest)
-        u0 = solve(still, where, u0, float(t) + t1, t0=float(t), stop_when=stopping, throw=throw).u_end
-    if isinstance(equation, Diffusion) and is_one_system:
-        return _steady_diffusion(equation, surface, u0, first, time, preconditioner, throw)
-    u, rate, wanted, steps = _newton(equation, surface, u0, time, preconditioner, tolerance)
-    if throw and not isinstance(u, Tracer) and not float(rate) <= float(wanted):
+        condition = Steady(min(1e-4, 1e3 * rtol))
+        # The state at the end does not depend on the path to it, so the path carries no derivatives.
+        numbers, others = eqx.partition((equation, surface, u0), eqx.is_inexact_array)
+        fixed_equation, fixed_surface, start = eqx.combine(jax.lax.stop_gradient(numbers), others)
+        start = solve(
+            fixed_equation, fixed_surface, start, float(t) + t1, t0=float(t), stop_when=condition, throw=throw
+        ).u_end
+    if isinstance(equation, Diffusion) and is_linear:
+        return _steady_diffusion(equation, surface, start, u0, time, inverse, throw)
+    root = _steady_by_newton(equation, surface, start, time, inverse, rtol)
+    if throw and not isinstance(root.u, Tracer) and not float(root.rate) <= float(root.bound):
         raise SolveError(
-            f"No stationary state was found: after {int(steps)} steps the rate is {float(rate):.2g}, expected at "
-            f"most {float(wanted):.2g}. Causes are (a) a state that oscillates, travels or grows for ever, (b) a start "
-            'too far away: try method="marching", or (c) a tolerance beyond the float type.'
+            f"No stationary state was found: after {int(root.steps)} steps the rate is {float(root.rate):.2g}, "
+            f"expected at most {float(root.bound):.2g}. Possible causes are (a) a state that oscillates, travels or "
+            'grows for ever, (b) an initial state too far away: try method="marching", or (c) an rtol below the '
+            "precision of the float type."
         )
-    return u
+    return root.u
 
 
 def _steady_diffusion(
-    equation: Diffusion, surface: Surface, start: Array, u0: Array, time: Array, preconditioner, throw: bool
-):
-    """The stationary state, sought from a start, that has the mass of u0."""
-    # The data at this time, from here on without one.
+    equation: Diffusion, surface: Surface, start: Array, u0: Array, time: Array, inverse: Preconditioner, throw: bool
+) -> Array:
+    """The stationary state with the mass of u0, by a linear solve that begins at ``start``."""
+    # From now on the source does not depend on time.
     source = equation.explicit_rate(time, surface, u0)
-    still = eqx.tree_at(lambda e: e.source, equation, source, is_leaf=lambda x: x is None)
-    none = jnp.zeros(surface.num_vertices, u0.dtype)
-    tolerance = 1e-11 if u0.dtype == jnp.float64 else 1e-5
-    u, mean, size, converged, steps = _stationary(still, surface, start, time, none, preconditioner, tolerance)
-    if not isinstance(u, Tracer) and throw:
-        if not bool(converged):
-            raise SolveError(_unconverged(int(steps), preconditioner))
-        said, share = _incompatible(surface, mean, size) or ("", 0.0)
-        if share > _INCOMPATIBLE:
+    frozen = eqx.tree_at(lambda e: e.source, equation, source, is_leaf=lambda x: x is None)
+    no_screening = jnp.zeros(surface.num_vertices, u0.dtype)
+    rtol = 1e-11 if u0.dtype == jnp.float64 else 1e-5
+    state = stationary_diffusion(frozen, surface, start, time, no_screening, inverse, rtol)
+    if throw and not isinstance(state.u, Tracer):
+        raise_unless_converged(state, inverse)
+        words, ratio = excess_mean(surface, state.mean, state.size) or ("", 0.0)
+        if ratio > INCOMPATIBLE:
             raise SolveError(
-                f"There is no stationary state: source and fluxes have {said} and nothing takes it away, so that u "
-                "grows for ever. Take the mean off, or hold u on a boundary."
+                f"There is no stationary state: source and fluxes have {words} and nothing absorbs it, so u grows for "
+                "ever. Subtract the mean, or hold u on a boundary."
             )
-        if said:
+        if words:
             warnings.warn(
-                f"Source and fluxes have {said} and nothing takes it away, so that u grows for ever. The state is that "
-                "without the mean.",
+                f"Source and fluxes have {words} and nothing absorbs it, so u grows for ever. The result is the "
+                "stationary state without this mean.",
                 IncompatibleSourceWarning,
-                stacklevel=3,
+                stacklevel=5,
             )
-    conserved = surface.mass if isinstance(surface.scheme, Monotone) and not surface.is_traced else surface.vertex_areas
-    has_conditions = any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions)
-    if has_conditions:
-        return u
-    lost = _over_components(surface, conserved.reshape(-1, *(1,) * (u.ndim - 1)) * (u0 - u))
-    total = _over_components(surface, conserved).reshape(-1, *(1,) * (u.ndim - 1))
-    return u + (lost / total)[surface.topology.components]
+    if any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions):
+        return state.u
+    is_conserving = isinstance(surface.scheme, Monotone) and not surface.is_traced
+    measure = surface.mass if is_conserving else surface.vertex_areas
+    return state.u + component_means(surface, u0 - state.u, measure)[surface.topology.components]
+
+
+class _Root(NamedTuple):
+    """A state at which the rate nearly vanishes.
+
+    Attributes:
+        u: the state.
+        rate: root mean square of the rate at it.
+        bound: root mean square up to which the state counts as stationary.
+        steps: number of steps of the continuation.
+    """
+
+    u: Float[Array, "V *S"]
+    rate: Float[Array, ""]
+    bound: Float[Array, ""]
+    steps: Int[Array, ""]
 
 
 @eqx.filter_jit
-def _newton(equation, surface, u0, time, multigrid, tolerance):
-    preconditioning = Preconditioning(multigrid)
+def _steady_by_newton(
+    equation: Equation, surface: Surface, u0: Array, time: Array, preconditioner: Preconditioner, rtol: Any
+) -> _Root:
     u0 = equation.held(time, surface, u0)
-    diffusivities = equation.diffusivities(u0)
-    flat = diffusivities.reshape(-1)
+    diffusivities = equation.diffusivities(u0).reshape(-1)
     stiffness = equation.spectral_bound(time, surface, u0)
-    if isinstance(equation, Diffusion | ReactionDiffusion):
-        diffusion = spread_bound(surface, equation.diffusivity, equation.conditions, time, u0)
-    else:
-        diffusion = jnp.max(flat) * spectral_bound(surface)
-    reaction = jnp.maximum(stiffness - diffusion, 0)
-
+    reaction = jnp.maximum(stiffness - equation.diffusion_bound(time, surface, u0), 0)
     is_held = bounds.held_values(surface, equation.conditions, u0)
 
     def rate(u):
-        # What is held returns to its value, which makes the system regular and lets derivatives see the data.
+        # Held values return to their data. This makes the system regular, and the derivative sees the data.
         return jnp.where(is_held, equation.held(time, surface, u) - u, equation.rate(time, surface, u))
 
-    dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, _SLOWEST * stiffness))
-
     def inverse(shift):
-        alpha = jnp.broadcast_to(shift + reaction / 4, flat.shape)
-        return jax.lax.stop_gradient(preconditioning.of(surface, alpha, flat))
+        alpha = jnp.broadcast_to(shift + reaction / 4, diffusivities.shape)
+        return jax.lax.stop_gradient(preconditioner.shifted(alpha, diffusivities))
 
-    # Of a start at zero, what the rate there makes of it.
-    least = jax.lax.stop_gradient(jnp.maximum(rms(rate(u0)) * dt0, jnp.finfo(u0.dtype).tiny))
+    dt0 = jax.lax.stop_gradient(1 / jnp.maximum(reaction, _SLOWEST * stiffness))
+    # A start at zero has the size that the initial rate gives it within this time.
+    smallest = jax.lax.stop_gradient(jnp.maximum(rms(rate(u0)) * dt0, jnp.finfo(u0.dtype).tiny))
+    largest = _GROWN * jnp.maximum(rms(u0), smallest)
+    u, steps = _continuation(rate, inverse, u0, dt0, smallest, largest, rtol)
+    u = equation.held(time, surface, _newton(rate, inverse(0.0), u, rtol))
+    # Rounding may leave a larger rate than the tolerance allows.
+    rounding = 20 * jnp.finfo(u.dtype).eps * equation.spectral_bound(time, surface, u)
+    bound = jnp.where(rms(u) <= largest, jnp.maximum(10 * rtol, rounding) * rms(u), 0)
+    return _Root(u, rms(rate(u)), bound, steps)
 
-    def march(carry):
+
+def _continuation(
+    rate: Rate, inverse: Callable[[Array], Preconditioner], u0: Array, dt0: Array, smallest: Array, largest: Array,
+    rtol: Any,
+) -> tuple[Array, Array]:  # fmt: skip
+    """The state after pseudo-transient continuation, without derivatives, and the number of steps.
+
+    Args:
+        rate: the rate of change.
+        inverse: preconditioner of ``shift - derivative of the rate``.
+        u0: initial state.
+        dt0: first time step.
+        smallest: size that a state near zero counts with.
+        largest: size beyond which the state will not become stationary.
+        rtol: rate relative to the state at which the continuation ends.
+    """
+
+    def step(carry):
         u, value, dt, steps = carry
         _, derivative = jax.linearize(rate, u)
         operator = lx.FunctionLinearOperator(lambda d: d / dt - derivative(d), jax.eval_shape(lambda: u))
-        found = lx.linear_solve(operator, value, GMRES(1e-3, inverse(1 / dt)), throw=False)
-        change = rms(found.value) / jnp.maximum(rms(u), least)
-        # Steps that change the state by a tenth; one that changes it by half is taken back.
-        is_good = (change < 0.5) & (found.result == lx.RESULTS.successful)
-        growth = jnp.where(is_good, jnp.clip(0.1 / jnp.maximum(change, 1e-30), 0.2, 3.0), 0.2)
-        proposed = jnp.where(is_good, u + found.value, u)
-        # No longer than what settles all but neutral modes, such as a pattern's turning on a sphere: those would make
-        # the system singular.
-        return proposed, rate(proposed), jnp.minimum(dt * growth, _LONGEST * dt0), steps + 1
+        solution = lx.linear_solve(operator, value, GMRES(1e-3, inverse(1 / dt)), throw=False)
+        change = rms(solution.value) / jnp.maximum(rms(u), smallest)
+        # Steps are meant to change the state by a tenth. A step that changes it by half is rejected.
+        is_accepted = (change < 0.5) & (solution.result == lx.RESULTS.successful)
+        growth = jnp.where(is_accepted, jnp.clip(0.1 / jnp.maximum(change, 1e-30), 0.2, 3.0), 0.2)
+        u = jnp.where(is_accepted, u + solution.value, u)
+        # The longest step settles all but neutral modes, such as the rotation of a pattern on a sphere. Those would
+        # make the system of a longer step singular.
+        return u, rate(u), jnp.minimum(dt * growth, _LONGEST * dt0), steps + 1
 
     def goes_on(carry):
         u, value, _, steps = carry
-        return (rms(value) > tolerance * rms(u)) & (steps < _MAX_MARCH) & (rms(u) <= largest)
+        return (rms(value) > rtol * rms(u)) & (steps < _MAX_STEPS) & (rms(u) <= largest)
 
-    # A state that grew this much, over its start or what the rate there makes of it, has no end to its growth.
-    largest = _GROWN * jnp.maximum(rms(u0), least)
-    frozen = jax.lax.stop_gradient((u0, rate(u0), dt0))
-    u, _, _, steps = jax.lax.while_loop(goes_on, march, (*frozen, jnp.zeros((), jnp.int32)))
-    u = jax.lax.stop_gradient(u)
+    start = jax.lax.stop_gradient((u0, rate(u0), dt0))
+    u, _, _, steps = jax.lax.while_loop(goes_on, step, (*start, jnp.zeros((), jnp.int32)))
+    return jax.lax.stop_gradient(u), steps
 
-    def residual(u, args):
-        return args(u)
 
-    exact = GMRES(1e-10 if u.dtype == jnp.float64 else 1e-5, inverse(0.0))
-    goal: Any = jnp.asarray(tolerance, u.dtype)
-    found = optx.root_find(
-        residual,
-        optx.Newton(goal, goal, optx.rms_norm, linear_solver=exact),
+def _newton(rate: Rate, inverse: Preconditioner, u: Array, rtol: Any) -> Array:
+    """The root of the rate next to u, differentiable by the implicit function theorem.
+
+    Where Newton's method does not reduce the rate, the value is u itself; the derivative is still that of the root.
+    """
+    linear_solver = GMRES(1e-10 if u.dtype == jnp.float64 else 1e-5, inverse)
+    tolerance: Any = jnp.asarray(rtol, u.dtype)
+    root = optx.root_find(
+        lambda u, rate: rate(u),
+        optx.Newton(tolerance, tolerance, optx.rms_norm, linear_solver=linear_solver),
         u,
         eqx.filter_closure_convert(rate, u),
         max_steps=_MAX_NEWTON,
-        adjoint=optx.ImplicitAdjoint(exact),
+        adjoint=optx.ImplicitAdjoint(linear_solver),
         throw=False,
-    )
-    # Where Newton's last steps did not help, what the march found stands; the derivative is that of the root.
-    is_better = rms(rate(found.value)) <= rms(rate(u))
-    best = jax.lax.stop_gradient(jnp.where(is_better, found.value, u))
-    best = best + (found.value - jax.lax.stop_gradient(found.value))
-    best = equation.held(time, surface, best)
-    # Ten times the goal, or what rounding leaves of the rate of such a state.
-    rounding = 20 * jnp.finfo(u.dtype).eps * equation.spectral_bound(time, surface, best)
-    wanted = jnp.where(rms(best) <= largest, jnp.maximum(10 * tolerance, rounding) * rms(best), 0)
-    return best, rms(rate(best)), wanted, steps
+    ).value
+    is_better = rms(rate(root)) <= rms(rate(u))
+    value = jax.lax.stop_gradient(jnp.where(is_better, root, u))
+    return value + (root - jax.lax.stop_gradient(root))

@@ -1,4 +1,4 @@
-"""Vectors carried over a whole surface by a little diffusion, and direction fields made smooth by it.
+"""Transport of vectors over a whole surface by a short diffusion, and direction fields smoothed by diffusion.
 
 What enters: a surface, and vectors at some vertices or everywhere. What leaves: tangent fields.
 """
@@ -24,13 +24,16 @@ from .._tables import AnyArray, difference_matrix
 from .distance import checked_sources
 from .evolve import solve
 
-# The step of heat, over the shortest that tells shortest paths, and the width of what replaces a source, over the mean
-# length of its edges: the row of one vertex does not see a source exactly where it is, many together do.
-_STEP, _WIDTH = 4, 1.5
+# Default time of the heat step, in multiples of `_shortest_time`.
+_STEP = 4
+# A source is spread over a bell of this width, in mean lengths of its edges. The row of one vertex does not see a
+# source exactly where it is, but many rows together do.
+_WIDTH = 1.5
+# Number of rings around a source that the bell covers.
 _RINGS = 6
-# The heat at a distance d is about exp(-d / sqrt(time)); over the size of the surface it must not leave float64.
+# The heat at a distance d is about exp(-d / sqrt(time)). Across the surface it must stay within the range of float64.
 _DECAY = 500
-# How far below zero eigenvalues are sought from, times the area.
+# Eigenvalues are searched next to minus this number over the area.
 _SHIFT = 1e-3
 
 
@@ -41,33 +44,36 @@ def transport_vectors(
     vectors: Float[AnyArray, "*n 3"],
     time: float | None = None,
 ) -> Float[Array, "V 3"]:
-    """Vectors at some vertices carried over the whole surface: every vertex takes that of the nearest (host).
+    """The tangent field of vectors at some vertices, carried to every vertex from the nearest of them (host).
 
-    Parallel transport along shortest paths, by one backward Euler step of vector heat whose direction counts; lengths
-    come from scalar heat. Sources are spread over a few edges: one vertex is not seen exactly where it is. On spheres
-    of 2,562 to 10,242 vertices errors are .05 to .4 degrees (benchmarks/imaging.md) and fall more slowly than the mesh
-    size, as the step is tied to it. Which vertex takes what from whom is found on the host by sparse elimination, which
-    keeps its relative accuracy where heat is tiny; from there on it is JAX, differentiable in the vectors. Takes 24
-    bytes for each vertex and source, and a multiple of that while it is found.
+    This is parallel transport along shortest paths. The directions are those of one backward Euler step of vector heat,
+    and the lengths come from scalar heat. Each source is spread over a few edges, because the row of one vertex does
+    not see it exactly where it is. On spheres of 2,562 to 10,242 vertices the errors are 0.05 to 0.4 degrees
+    (benchmarks/imaging.md). They fall more slowly than the mesh size, because the time of the step is tied to it.
+
+    The response to each source is computed on the host by sparse elimination, which keeps its relative accuracy where
+    heat is tiny. Its combination with the vectors runs in JAX and is differentiable in the vectors. It takes 24 bytes
+    for each vertex and source, and a multiple of that while the response is computed.
 
     Args:
         surface: a `Monotone` surface.
-        sources: indices of n vertices, or one.
-        vectors: (n, 3), or (3,) for one; tangent.
-        time: of the step, positive; by default four times the square of the mean distance of neighbours.
+        sources: (n,) indices of vertices, or one index.
+        vectors: (n, 3) tangent vectors at the sources, or (3,) for one source.
+        time: positive time of the heat step; by default four times the square of the mean edge length.
 
     Returns:
-        (V, 3); zero on a component without a source.
+        (V, 3) tangent field, zero on a component without a source.
 
     Raises:
-        ValueError: sources are not on the surface, vectors do not fit them or are not tangent, the time is not
-            positive, or the surface is being traced.
+        ValueError: a source is not on the surface, the vectors do not match the sources or are not tangent, the time is
+            not positive, or the surface is being traced.
 
     Source: Sharp, Soliman and Crane (2019), The vector heat method, doi:10.1145/3243651.
     """
     if surface.is_traced:
         raise ValueError(
-            "Vector heat is computed on the host, but the surface is being traced by a JAX transformation."
+            "Vector heat is computed on the host, but the surface is being traced by a JAX transformation. Call "
+            "ltl.vectors.transport_vectors outside."
         )
     sources = checked_sources(surface, sources)
     if time is not None and not time > 0:
@@ -78,14 +84,15 @@ def transport_vectors(
         raise ValueError(f"Expected a vector for each of {len(sources)} sources, found shape {vectors.shape}.")
     everywhere = jnp.zeros((surface.num_vertices, 3), surface.dtype).at[sources].set(vectors)
     check_tangent(surface, everywhere)
-    with jax.ensure_compile_time_eval():  # inside jit too, of a surface that is not traced
-        carried, heat = _responses(surface, sources, _STEP * _shortest_step(surface) if time is None else time)
-    return _mixed(surface, sources, vectors, carried, heat)
+    time = _STEP * _shortest_time(surface) if time is None else time
+    with jax.ensure_compile_time_eval():  # A surface that is not traced has responses inside jit as well.
+        carried, heat = _responses(surface, sources, time)
+    return _combined(surface, sources, vectors, carried, heat)
 
 
 @eqx.filter_jit
-def _mixed(surface: Surface, sources, vectors: Array, carried: Array, heat: Array) -> Array:
-    """The field (V, 3) of what each source's unit vectors become, (V, n, 2), and its heat (V, n)."""
+def _combined(surface: Surface, sources: Any, vectors: Array, carried: Array, heat: Array) -> Array:
+    """The field (V, 3) of vectors at the sources, from the responses to unit vectors and to heat at each source."""
     frames = surface.geometry.frames[sources]
     x, y = jnp.einsum("nc,nac->an", vectors, frames)
     real, imaginary = carried[..., 0], carried[..., 1]
@@ -99,15 +106,17 @@ def _mixed(surface: Surface, sources, vectors: Array, carried: Array, heat: Arra
     return from_frame(surface, length[:, None] * unit)
 
 
-def _shortest_step(surface: Surface) -> float:
-    """The time of a step of heat that tells shortest paths (host): the squared mesh size, or what float64 can hold."""
+def _shortest_time(surface: Surface) -> float:
+    """The shortest useful time of a heat step (host): the squared mesh size, or more if float64 would underflow."""
     diameter = float(np.linalg.norm(np.ptp(np.asarray(surface.vertices, np.float64), axis=0)))
     return max(float(surface.mesh_size), 2 * diameter / _DECAY) ** 2
 
 
 def _responses(surface: Surface, sources: np.ndarray, time: float) -> tuple[Array, Array]:
-    """What a step of heat makes everywhere of the first vector of each source's frame, (V, n, 2), and of one, (V, n);
-    at every vertex over the warmest source's."""
+    """The responses to a heat step from each source: to the first vector of its frame (V, n, 2) and to heat (V, n).
+
+    Both are divided at every vertex by the heat of the warmest source there.
+    """
     size = surface.num_vertices
     near, owner, share = _spread(surface, sources)
     normals, frames = (np.asarray(a, np.float64) for a in (surface.normals, surface.geometry.frames))
@@ -116,8 +125,8 @@ def _responses(surface: Surface, sources: np.ndarray, time: float) -> tuple[Arra
     shape = (size, len(sources))
     vector_heat: Any = scipy.sparse.csc_array((share * (z[:, 0] + 1j * z[:, 1]), (near, owner)), shape).toarray()
     scalar_heat: Any = scipy.sparse.csc_array((share, (near, owner)), shape).toarray()
-    scalar = _step(laplacian_matrix(surface).astype(np.float64), time).solve(scalar_heat)
-    vector = _step(connection_matrix(surface), time).solve(vector_heat)
+    scalar = _factorized_step(laplacian_matrix(surface).astype(np.float64), time).solve(scalar_heat)
+    vector = _factorized_step(connection_matrix(surface), time).solve(vector_heat)
     warmest = scalar.max(axis=1, keepdims=True)
     scale = np.where(warmest > 0, warmest, 1)
     vector, scalar = vector / scale, np.maximum(scalar, 0) / scale
@@ -126,11 +135,13 @@ def _responses(surface: Surface, sources: np.ndarray, time: float) -> tuple[Arra
 
 
 def _spread(surface: Surface, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The vertices around each source, which source they belong to, and their shares: a bell whose centre of mass, in
-    the measure that diffusion conserves, is the source.
+    """A bell around each source whose centre of mass, in the measure that diffusion conserves, is the source.
 
-    The rows that use one vertex see it away from where it is, as the operator is not symmetric; over many this evens
-    out.
+    The operator is not symmetric, so the rows that use a vertex see it slightly displaced. The bell averages over many
+    vertices.
+
+    Returns:
+        The vertices of the bells, the number of the source that each belongs to, and their shares.
     """
     vertices, normals, frames = (
         np.asarray(a, np.float64) for a in (surface.vertices, surface.normals, surface.geometry.frames)
@@ -146,7 +157,7 @@ def _spread(surface: Surface, sources: np.ndarray) -> tuple[np.ndarray, np.ndarr
     width = (_WIDTH * np.bincount(beside, edges) / np.bincount(beside))[owner]
     away = vertices[near] - vertices[sources[owner]]
     bell = np.exp(-np.sum(away**2, axis=1) / (2 * width**2))
-    # The other side of a thin part is not near.
+    # Vertices on the opposite side of a thin part are near in space but not along the surface.
     bell = bell * (np.sum(normals[near] * normals[sources[owner]], axis=1) > 0)
     place = np.einsum("nc,nac->an", away, frames[sources[owner]])
     weight = np.asarray(surface.mass, np.float64)[near] * bell
@@ -157,41 +168,41 @@ def _spread(surface: Surface, sources: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return near, owner, bell * np.maximum(1 + np.sum(tilt[owner] * place.T, axis=1), 0)
 
 
-def _step(operator: Any, time: float) -> Any:
-    """The factor of a backward Euler step, without pivoting, so that nothing is subtracted."""
+def _factorized_step(operator: Any, time: float) -> Any:
+    """The factors of a backward Euler step, without pivoting, so that elimination involves no cancellation."""
     stepped = scipy.sparse.eye_array(operator.shape[0]) - time * operator
     return scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(stepped), diag_pivot_thresh=0.0)
 
 
 @on_surface
 def connection_matrix(surface: Surface, symmetry: int = 1) -> scipy.sparse.csr_array:
-    """The vector Laplacian as a complex sparse matrix (V, V) on the components in the frames (host)."""
+    """The vector Laplacian as a complex sparse matrix (V, V) that acts on components in the frames (host)."""
     with jax.ensure_compile_time_eval():
         along = connection(surface, symmetry)
     x, y = (difference_matrix(along.table, weights).astype(np.float64) for weights in along.turned)
-    left = np.asarray(along.centre, np.float64)
-    return scipy.sparse.csr_array(x + 1j * y + scipy.sparse.diags_array(left[0] + 1j * left[1]))
+    centre = np.asarray(along.centre, np.float64)
+    return scipy.sparse.csr_array(x + 1j * y + scipy.sparse.diags_array(centre[0] + 1j * centre[1]))
 
 
 @on_surface
 def direction_field(
     surface: Surface, symmetry: int = 4, guide: Float[AnyArray, "V 3"] | None = None, time: float | None = None
 ) -> Float[Array, "V 3"]:
-    """A smooth field of directions that looks the same after a turn by 1/symmetry: one unit arm at every vertex.
+    """A smooth direction field with rotational symmetry, as one of its unit vectors (an arm) at every vertex.
 
-    The field's power, which does not tell its arms apart, is smoothed: from a guide by diffusion for a time (lengths
-    count as weights, and where the guide vanishes its surroundings decide); without one the smoothest field of all is
-    taken, the lowest eigenvector of the power's Laplacian (host).
+    The power of the field, which is the same for all arms, is smoothed. With a guide, the guide's power diffuses for a
+    time: lengths count as weights, and where the guide vanishes its surroundings decide. Without a guide, the smoothest
+    field is the lowest eigenvector of the power's Laplacian (host).
 
     Args:
         surface: a `Monotone` or `Polynomial` surface.
-        symmetry: 1 for vectors, 2 for lines, 4 for crosses, as for quadrilaterals.
-        guide: (V, 3), tangent, such as a principal direction times how far the curvatures differ.
-        time: for which a guide diffuses: details finer than its square root vanish.
+        symmetry: number of arms: 1 for vectors, 2 for lines, 4 for crosses, as for quadrilaterals.
+        guide: (V, 3) tangent field, such as a principal direction times the difference of the principal curvatures.
+        time: duration of the guide's diffusion, which removes details finer than its square root.
 
     Raises:
-        ValueError: a guide without a time or a time without a guide; the guide does not fit, is not tangent, or
-            vanishes on a component; without a guide, the surface is being traced.
+        ValueError: a guide is given without a time or a time without a guide; the guide does not fit the surface, is
+            not tangent, or vanishes on a component; or there is no guide and the surface is being traced.
 
     Source: Knoppel, Crane, Pinkall and Schroder (2013), Globally optimal direction fields,
     doi:10.1145/2461912.2462005.
@@ -199,9 +210,9 @@ def direction_field(
     if guide is None and time is None:
         return _arm(surface, jnp.asarray(_smoothest(surface, symmetry), surface.dtype), symmetry)
     if guide is None or time is None:
-        raise ValueError("Expected a guide and the time for which it is smoothed, or neither for the smoothest field.")
+        raise ValueError("Expected a guide and the time for which it diffuses, or neither for the smoothest field.")
     check_tangent(surface, guide)
-    _points_somewhere(surface, guide)
+    _check_nonzero(surface, guide)
     z = to_frame(surface, jnp.asarray(guide, surface.dtype))
     size = jnp.sqrt(jnp.maximum(jnp.sum(z**2, axis=-1, keepdims=True), jnp.finfo(z.dtype).tiny))
     raised = from_frame(surface, size * power(z / size, symmetry))
@@ -211,28 +222,29 @@ def direction_field(
 
 @eqx.filter_jit
 def _arm(surface: Surface, z: Array, symmetry: int) -> Array:
-    """The unit vector whose power has the direction of z."""
+    """The unit vectors whose powers have the directions of z."""
     angle = jnp.arctan2(z[:, 1], z[:, 0]) / symmetry
     return from_frame(surface, jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1))
 
 
 def _smoothest(surface: Surface, symmetry: int) -> np.ndarray:
+    """The components (V, 2) of the power of the smoothest field (host)."""
     if surface.is_traced:
         raise ValueError(
-            "The smoothest field is found on the host, but the surface is being traced by a JAX transformation. "
+            "The smoothest field is computed on the host, but the surface is being traced by a JAX transformation. "
             "Compute it outside, or hand in a guide."
         )
     matrix, components = -connection_matrix(surface, symmetry), np.asarray(surface.topology.components)
     areas = np.bincount(components, np.asarray(surface.vertex_areas))
     z = np.zeros(len(components), np.complex128)
     for component, area in enumerate(areas):
-        here = np.flatnonzero(components == component)
-        z[here] = lowest(matrix[here][:, here], 1, _SHIFT / area)[0]
+        members = np.flatnonzero(components == component)
+        z[members] = lowest(matrix[members][:, members], 1, _SHIFT / area)[0]
     return np.stack([z.real, z.imag], axis=-1)
 
 
-def _points_somewhere(surface: Surface, guide: AnyArray) -> None:
-    """Raise where a guide vanishes on a whole component, which is then left without a direction."""
+def _check_nonzero(surface: Surface, guide: AnyArray) -> None:
+    """Raise if a guide vanishes on a whole component, where it would determine no direction."""
     if isinstance(guide, Tracer) or surface.is_traced:
         return
     components = np.asarray(surface.topology.components)
@@ -241,17 +253,17 @@ def _points_somewhere(surface: Surface, guide: AnyArray) -> None:
     if not (longest > 0).all():
         where = f"component {int(np.argmin(longest))}" if len(longest) > 1 else "the surface"
         raise ValueError(
-            f"Expected a guide that points somewhere, found zero on all of {where}. Without a guide the smoothest "
-            "field is taken."
+            f"Expected a guide that is not zero everywhere, found zero on all of {where}. Leave out guide and time "
+            "for the smoothest field."
         )
 
 
 def lowest(matrix: Any, number: int, shift: float) -> Any:
     """The eigenvectors (number, V) of a complex sparse matrix whose eigenvalues are nearest to ``-shift`` (host)."""
     size = matrix.shape[0]
-    factor = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(matrix + shift * scipy.sparse.eye_array(size)))
+    factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(matrix + shift * scipy.sparse.eye_array(size)))
     operator: Any = scipy.sparse.linalg.LinearOperator
-    inverse = operator(matrix.shape, matvec=factor.solve, dtype=np.complex128)
+    inverse = operator(matrix.shape, matvec=factors.solve, dtype=np.complex128)
     start = np.random.default_rng(0).normal(size=(size, 2)) @ [1, 1j]
     options: Any = dict(k=number, sigma=-shift, OPinv=inverse, v0=start)
     return scipy.sparse.linalg.eigs(matrix, **options)[1].T

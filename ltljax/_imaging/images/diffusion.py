@@ -16,8 +16,7 @@ from ..._base.deprecated import deprecated_alias
 from ..._equations import Diffusion, Equation
 from ..._operators import gradient, laplacian, spectral_bound, weighted_laplacian
 from ..._solve.evolve import solve
-from ..._solve.implicit import Jacobi
-from ..._solve.krylov import linear_solve
+from ..._solve.krylov import Jacobi, linear_solve
 from ..._solve.stabilised import RKL1
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
@@ -66,7 +65,7 @@ def implicit_step(
 ) -> tuple[Float[Array, "V *C"], Bool[Array, ""]]:
     """The image after one implicit Euler step of diffusion, and whether the system was solved; NaN if not."""
     time = jnp.asarray(time, u.dtype)
-    inverse = Jacobi(1 / (1 - time * surface.laplacian_stencil.diagonal()[:, None]))
+    inverse = Jacobi(1 - time * surface.laplacian_stencil.diagonal()[:, None])
     tolerance = _EXACT[jnp.dtype(u.dtype)]
     # Solving for the change of u leaves constants unchanged to the last digit.
     right = time * laplacian(surface, u)

@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._base.deprecated import renamed_arguments
 from ..._operators import laplacian
-from ..._solve.implicit import Jacobi
-from ..._solve.krylov import linear_solve
+from ..._solve.krylov import Jacobi, linear_solve
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .signals import check, number, signal
@@ -126,7 +125,7 @@ def _segmented(
         return 2 / width + jnp.sum(misfits(phi), axis=0)
 
     def inverse(stiffness: Array) -> Jacobi:
-        return Jacobi(1 / (stiffness - width * surface.laplacian_stencil.diagonal())[:, None])
+        return Jacobi((stiffness - width * surface.laplacian_stencil.diagonal())[:, None])
 
     def step(carry):
         phi, _, iterations = carry

@@ -19,8 +19,7 @@ from ..._equations import Diffusion, Dirichlet
 from ..._operators import laplacian
 from ..._solve import Multigrid, SolveError
 from ..._solve.evolve import hierarchy
-from ..._solve.implicit import Cycle, Jacobi
-from ..._solve.krylov import Preconditioner, linear_solve
+from ..._solve.krylov import Jacobi, Preconditioner, linear_solve
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .volume import check_volume, volumes, with_volumes
@@ -216,8 +215,7 @@ class _Squared(Preconditioner):
 def _inverse(surface: Surface, strength: Array, order: int, multigrid: Multigrid | None) -> Preconditioner:
     if multigrid is None:
         main: Any = surface.laplacian_stencil.diagonal()
-        return Jacobi(1 / (1 - strength * main if order == 1 else 1 + strength * main**2)[:, None])
+        return Jacobi((1 - strength * main if order == 1 else 1 + strength * main**2)[:, None])
     ones = jnp.ones(3, strength.dtype)
-    if order == 1:
-        return Cycle(multigrid, ones, strength * ones)
-    return _Squared(Cycle(multigrid, ones, strength**0.5 * ones))
+    shifted = multigrid.shifted
+    return shifted(ones, strength * ones) if order == 1 else _Squared(shifted(ones, strength**0.5 * ones))
