@@ -104,19 +104,18 @@ def spread_width(surface: Surface, spreads: Spreads, u: Float[Array, "V *S"]) ->
     """The extent of the eigenvalues of `spread_rate` off the real axis, as in `ltl.operators.spectral_width`."""
 
     def width(spread: Spread) -> Array:
-        width = spread.spectral_width() if isinstance(spread, EllipticStencil) else _largest(spread) * laplacian
-        return width.astype(u.dtype)
+        is_stencil = isinstance(spread, EllipticStencil)
+        return (spread.spectral_width() if is_stencil else _largest(spread) * laplacian_width).astype(u.dtype)
 
-    laplacian = spectral_width(surface)
+    laplacian_width = spectral_width(surface)
     return _maximum(width, of_each(spreads, u))
 
 
 def _species_rate(surface: Surface, spread: Spread, u: Float[Array, " V"]) -> Float[Array, " V"]:
     if isinstance(spread, EllipticStencil):
         return spread(u)
-    # The harmonic mean of two neighbours needs a scheme with its own weights for diffusion.
-    mean = "arithmetic" if surface.topology.diffusion is None else "harmonic"
-    return weighted_laplacian(surface, jnp.broadcast_to(spread.astype(u.dtype), u.shape), u, mean)
+    diffusivity = jnp.broadcast_to(spread.astype(u.dtype), u.shape)
+    return weighted_laplacian(surface, diffusivity, u, surface.laplacian_stencil.means[-1])
 
 
 def _flux_weights(surface: Surface, spread: Spread) -> Float[Array, "B 2"] | None:

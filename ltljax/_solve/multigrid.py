@@ -27,21 +27,10 @@ import scipy.linalg
 import scipy.sparse
 from jaxtyping import Array, Float, Int
 
-from .._lifting.layout import PerBlock
 from .._lifting.schemes import Monotone
 from .._mesh import Mesh
-from .._operators import laplacian_matrix
 from .._surface import Surface, on_surface
-from .._tables import (
-    AnyArray,
-    ReverseWeights,
-    Table,
-    difference_sum,
-    reverse_weights,
-    reversible,
-    slot_sum,
-    weighted_table,
-)
+from .._tables import AnyArray, Stencil, reverse_weights, reversible, weighted_table
 from .krylov import Preconditioner
 
 # A level with at most this many vertices is solved by its eigenvectors.
@@ -57,43 +46,36 @@ class Interpolation(eqx.Module):
     """Interpolation from a level to the next finer one, and its transpose.
 
     Attributes:
-        table: neighbours from which the vertices that are not on the coarse level take their values.
-        shares: interpolation weights of these neighbours.
-        reverse: the same weights ordered for the transpose.
+        stencil: interpolation weights of the vertices that are not on the coarse level.
         coarse: (C,) fine-level indices of the vertices on the coarse level.
     """
 
-    table: Table
-    shares: PerBlock
-    reverse: ReverseWeights
+    stencil: Stencil
     coarse: Int[AnyArray, " C"]
 
     def prolong(self, u: Float[Array, "C S"]) -> Float[Array, "V S"]:
         """A coarse field on the fine level."""
-        values = jnp.zeros((self.table.num_vertices, u.shape[1]), u.dtype)
+        values = jnp.zeros((self.stencil.table.num_vertices, u.shape[1]), u.dtype)
         values = values.at[self.coarse].set(u, unique_indices=True, mode="promise_in_bounds")
         # A difference equals the neighbour's value at the other vertices, and coarse vertices have empty rows.
-        return values + difference_sum(self.table, self.shares, values)
+        return values + self.stencil(values)
 
     def restrict(self, r: Float[Array, "V S"]) -> Float[Array, "C S"]:
         """The transpose of `prolong`."""
-        (gathered,) = jax.linear_transpose(lambda e: difference_sum(self.table, self.shares, e, self.reverse), r)(r)
-        return (r + gathered).at[self.coarse].get(mode="promise_in_bounds", unique_indices=True)
+        return (r + self.stencil.transpose(r)).at[self.coarse].get(mode="promise_in_bounds", unique_indices=True)
 
 
 class Level(eqx.Module):
     """A level below the finest: ``alpha masses u + beta (absorption u - sum of differences)``, which is symmetric.
 
     Attributes:
-        table: neighbours.
-        conductances: weights of the differences to them.
+        conductances: the sum of differences to the neighbours.
         masses: (V,) sums of fine-level areas.
         absorption: (V,) what boundary conditions absorb.
         interpolation: interpolation from the next coarser level.
     """
 
-    table: Table
-    conductances: PerBlock
+    conductances: Stencil
     masses: Float[AnyArray, " V"]
     absorption: Float[AnyArray, " V"]
     interpolation: Interpolation
@@ -101,11 +83,11 @@ class Level(eqx.Module):
     def apply(self, alpha: Array, beta: Array, u: Float[Array, "V S"]) -> Float[Array, "V S"]:
         """The operator of the level applied to u."""
         local = alpha[None] * self.masses[:, None] + beta[None] * self.absorption[:, None]
-        return local * u - beta[None] * difference_sum(self.table, self.conductances, u)
+        return local * u - beta[None] * self.conductances(u)
 
     def diagonal(self, alpha: Array, beta: Array) -> Float[Array, "V S"]:
         """The diagonal of `apply`."""
-        leaving = self.absorption + slot_sum(self.table, self.conductances)
+        leaving = self.absorption + self.conductances.row_sums()
         return alpha[None] * self.masses[:, None] + beta[None] * leaving[:, None]
 
 
@@ -115,9 +97,7 @@ class Multigrid(Preconditioner):
     `shifted` sets alpha and beta without setting up the hierarchy again.
 
     Attributes:
-        table: neighbours of the Laplacian.
-        weights: weights of the Laplacian.
-        reverse: the same weights ordered for the transpose, if the surface has them.
+        laplacian: the Laplacian of `Monotone`.
         absorption: (V,) what boundary conditions absorb from -Delta.
         is_free: (V,) 1 where no value is held, else 0.
         measure: (V,) measure that the Laplacian nearly conserves.
@@ -129,9 +109,7 @@ class Multigrid(Preconditioner):
         beta: (S,) or (1,) coefficient of -Delta u.
     """
 
-    table: Table
-    weights: PerBlock
-    reverse: ReverseWeights | None
+    laplacian: Stencil
     absorption: Float[AnyArray, " V"]
     is_free: Float[AnyArray, " V"]
     measure: Float[AnyArray, " V"]
@@ -155,7 +133,7 @@ class Multigrid(Preconditioner):
         """``alpha u - beta Delta u`` including absorption, and u itself where values are held."""
         free = self.is_free[:, None]
         u_free = free * u
-        inward = self.absorption[:, None] * u_free - difference_sum(self.table, self.weights, u_free, self.reverse)
+        inward = self.absorption[:, None] * u_free - self.laplacian(u_free)
         return free * (self.alpha[None] * u_free + self.beta[None] * inward) + (1 - free) * u
 
     def __call__(self, r: Float[Array, "V *S"], transposed: bool = False) -> Float[Array, "V *S"]:
@@ -166,7 +144,7 @@ class Multigrid(Preconditioner):
         def apply(u):
             return jax.linear_transpose(self.apply, u)(u)[0] if transposed else self.apply(u)
 
-        leaving = self.absorption + slot_sum(self.table, self.weights)
+        leaving = self.absorption + self.laplacian.row_sums()
         free = self.is_free[:, None]
         diagonal = free * (self.alpha[None] + self.beta[None] * leaving[:, None]) + (1 - free)
         weights = free * self.measure[:, None]
@@ -244,28 +222,26 @@ def multigrid(surface: Surface, absorption: np.ndarray | None = None, is_held: n
 
 def _set_up(surface: Surface, absorption: np.ndarray, is_held: np.ndarray) -> Multigrid:
     vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces)
-    if not isinstance(surface.scheme, Monotone):
+    if not surface.scheme.is_monotone:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # They would concern a surface that the user did not ask for.
             surface = Surface.from_mesh(Mesh(vertices, faces), Monotone(), surface.dtype)
-    table, weights = surface.topology.diffusion, surface.geometry.laplacian_weights
-    assert table is not None
-    assert weights is not None
+    laplacian = surface.laplacian_stencil
+    assert isinstance(laplacian, Stencil)
     areas = np.asarray(surface.vertex_areas, np.float64)
     # What flows to held vertices is absorbed, and held vertices are decoupled from the others.
     is_free = (~is_held).astype(np.float64)
     free = scipy.sparse.diags_array(is_free)
     conductances = _cotangent_conductances(vertices, faces)
     absorbed = np.where(is_held, areas, areas * absorption + conductances @ is_held)
-    measure = _nearly_conserved(laplacian_matrix(surface), areas)
+    measure = _nearly_conserved(laplacian.matrix(), areas)
     coarse = _hierarchy(scipy.sparse.csr_array(free @ conductances @ free), areas, absorbed)
     cast = lambda a: jnp.asarray(a, surface.dtype if a.dtype.kind == "f" else a.dtype)  # noqa: E731
     absorption, is_free, measure, coarse = jax.tree.map(cast, (absorption, is_free, measure, coarse))
     interpolation, levels, eigenvalues, eigenvectors = coarse
-    reverse = surface.geometry.laplacian_reverse
     alpha, beta = jnp.zeros(1, surface.dtype), jnp.ones(1, surface.dtype)
     return Multigrid(
-        table, weights, reverse, absorption, is_free, measure, interpolation, levels, eigenvalues, eigenvectors,
+        laplacian, absorption, is_free, measure, interpolation, levels, eigenvalues, eigenvectors,
         alpha, beta,
     )  # fmt: skip
 
@@ -324,7 +300,9 @@ def _hierarchy(
         masses = fine.P.T @ masses
         if interpolation is not None:
             table, weights = weighted_table(-coarse.A)
-            levels.append(Level(table, weights, masses, np.asarray(coarse.A.sum(axis=1)).ravel(), interpolation))
+            levels.append(
+                Level(Stencil(table, weights), masses, np.asarray(coarse.A.sum(axis=1)).ravel(), interpolation)
+            )
     return interpolations[0], tuple(levels), *_modes(solver.levels[-1].A, masses)
 
 
@@ -340,7 +318,7 @@ def _interpolation(matrix: scipy.sparse.csr_array, coarse: np.ndarray) -> Interp
     table = reversible(table)
     reverse = reverse_weights(table, shares)
     assert reverse is not None
-    return Interpolation(table, shares, reverse, coarse.astype(np.int32))
+    return Interpolation(Stencil(table, shares, reverse), coarse.astype(np.int32))
 
 
 def _modes(matrix: Any, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

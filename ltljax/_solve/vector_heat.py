@@ -20,7 +20,7 @@ from .._lifting.frames import transport
 from .._mesh import k_ring, one_rings
 from .._operators import check_tangent, connection, from_frame, laplacian_matrix, power, to_frame
 from .._surface import Surface, on_surface
-from .._tables import AnyArray, difference_matrix
+from .._tables import AnyArray
 from .distance import checked_sources
 from .evolve import solve
 
@@ -178,10 +178,7 @@ def _factorized_step(operator: Any, time: float) -> Any:
 def connection_matrix(surface: Surface, symmetry: int = 1) -> scipy.sparse.csr_array:
     """The vector Laplacian as a complex sparse matrix (V, V) that acts on components in the frames (host)."""
     with jax.ensure_compile_time_eval():
-        along = connection(surface, symmetry)
-    x, y = (difference_matrix(along.table, weights).astype(np.float64) for weights in along.turned)
-    centre = np.asarray(along.centre, np.float64)
-    return scipy.sparse.csr_array(x + 1j * y + scipy.sparse.diags_array(centre[0] + 1j * centre[1]))
+        return connection(surface, symmetry).matrix()
 
 
 @on_surface

@@ -4,7 +4,7 @@ What enters: a table and its weights. What leaves: the operator applied to a fie
 diagonal and a bound of its spectrum. `ComposedStencil` is a sum of products of stencils with the same methods.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -29,6 +29,9 @@ class Stencil(eqx.Module):
             it from the weights when it is needed.
         centre: (V,) the weight of the vertex's own value; None for an operator that maps constants to zero.
     """
+
+    # The means of a conductivity that `with_conductivity` accepts; the last one suits conductivities that jump.
+    means: ClassVar[tuple[Mean, ...]] = ("arithmetic", "harmonic")
 
     table: Table
     weights: tuple[AnyArray, ...]
@@ -99,6 +102,8 @@ class ComposedStencil(eqx.Module):
         outer: the stencils that are applied last.
         inner: the stencils that are applied first, as many.
     """
+
+    means: ClassVar[tuple[Mean, ...]] = ("arithmetic",)
 
     outer: tuple[Stencil, ...]
     inner: tuple[Stencil, ...]

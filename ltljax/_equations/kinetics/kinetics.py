@@ -58,13 +58,13 @@ def with_params(rates: Rates, species: tuple[str, ...], resting: Resting, **para
 def _together(rates: Rates, u: Array, params: Any) -> Array:
     count = u.shape[1]
     try:
-        result = rates(tuple(u[:, s] for s in range(count)), params)
+        result: Any = rates(tuple(u[:, s] for s in range(count)), params)
     except ValueError as error:
         if "values to unpack" not in str(error):
             raise
         raise ValueError(f"The state has {count} species, and the reaction is for another number: {error}.") from error
     is_single = count == 1 and not isinstance(result, tuple | list) and jnp.ndim(result) < 2
-    columns = (result,) if is_single else tuple(result)
+    columns: tuple[Any, ...] = (result,) if is_single else tuple(result)
     if len(columns) != count or any(jnp.shape(column) not in ((), u.shape[:1]) for column in columns):
         shapes = ", ".join(str(jnp.shape(column)) for column in columns[:5])
         raise ValueError(
