@@ -1,7 +1,6 @@
-"""Pictures of what was computed, one call each, for notebooks and scripts (drawing comes with the extra `viz`).
+"""Pictures for notebooks and scripts: of fields and solutions on a surface, and of dispersion relations.
 
-What enters: a surface and fields on it, a solution, a dispersion relation. What leaves: what a notebook shows when a
-cell ends with it.
+Each function returns an object that a notebook shows. `plot` needs the extra `viz`.
 """
 
 from collections.abc import Sequence
@@ -23,24 +22,24 @@ def plot(
     colormap: str = "viridis",
     limits: tuple[float, float] | None = None,
 ) -> Any:
-    """A picture of a field from two sides, as a `PIL.Image` (host).
+    """A picture of a field on a surface from two opposite sides, as a `PIL.Image` (host).
 
     Args:
         surface: the surface.
-        u: (V,).
-        title: beside the colour bar.
-        colormap: one of `ltl.io.COLORMAPS`.
-        limits: the ends of the colours; by default the field's.
+        u: (V,) field.
+        title: title of the colour bar.
+        colormap: name of a colour map, a key of `ltl.io.COLORMAPS`.
+        limits: values at the ends of the colour map; by default, the smallest and the largest value of the field.
 
     Raises:
-        ValueError: the field does not fit the surface, or the colour map is not known.
+        ValueError: the field does not match the surface, or the colour map is not known.
         ImportError: the extra `viz` is not installed.
     """
     from ._output import pictures
 
-    values = _fitting(surface, u)
+    values = _checked_field(surface, u)
     if not pictures.can_draw():
-        raise ImportError('Pictures need the extra "viz": pip install "ltljax[viz]". ltl.view does without.')
+        raise ImportError('Pictures need the extra "viz": pip install "ltljax[viz]". ltl.view works without it.')
     from PIL import Image
 
     limits = limits or (float(np.nanmin(values)), float(np.nanmax(values)))
@@ -58,26 +57,26 @@ def view(
     colormap: str = "viridis",
     height: int = 560,
 ) -> Any:
-    """The viewer of a solution, or of one field, inside a notebook (host); ``.page`` is its HTML.
+    """An interactive viewer of a solution or a field, for notebooks (host); its attribute ``page`` is the HTML.
 
     Args:
         surface: the surface.
-        solution: what `solve` returned, with the times asked for; or a field (V,).
-        species: the names of the columns of the state; by default u, v, w or u0, u1, ...
-        title: at the top.
-        colormap: one of `ltl.io.COLORMAPS`.
-        height: in pixels.
+        solution: result of `solve` with the states at several times, or a field (V,).
+        species: names of the species; by default u, v, w, or u0, u1, ... for more than three.
+        title: title at the top.
+        colormap: name of a colour map, a key of `ltl.io.COLORMAPS`.
+        height: height in pixels.
 
     Raises:
-        ValueError: shapes do not fit, or the colour map is not known.
+        ValueError: the shapes do not match, or the colour map is not known.
     """
     from ._output.viewer import Inline, viewer_html
 
     if isinstance(solution, Solution):
-        reached = np.isfinite(np.asarray(solution.ts))
-        times, states = np.asarray(solution.ts)[reached], np.asarray(solution.us)[reached]
+        is_reached = np.isfinite(np.asarray(solution.ts))
+        times, states = np.asarray(solution.ts)[is_reached], np.asarray(solution.us)[is_reached]
     else:
-        times, states = np.zeros(1), _fitting(surface, solution)[None]
+        times, states = np.zeros(1), _checked_field(surface, solution)[None]
     states = states.reshape(*states.shape[:2], -1)
     count = states.shape[2]
     names = species or (("u", "v", "w")[:count] if count <= 3 else [f"u{s}" for s in range(count)])
@@ -90,34 +89,37 @@ def view(
 
 @on_surface
 def displaced(surface: Surface, u: Float[AnyArray, " V"], amount: float = 0.1) -> Mesh:
-    """The surface with a field as its relief, to be printed or rendered: a mesh (host).
+    """The surface with a field as its relief, as a mesh for printing or rendering (host).
+
+    Vertices move along the normals, from 0 where the field is smallest to ``amount`` where it is largest.
 
     Args:
         surface: the surface.
-        u: (V,). Vertices move along the normals, by nothing where it is least and by ``amount`` where it is largest.
-        amount: a length; a negative one moves inwards.
+        u: (V,) field.
+        amount: largest displacement, a length; negative values move vertices inwards.
 
     Raises:
-        ValueError: the field does not fit the surface, or is not finite.
-        MeshError: the relief is so high that faces fall together.
+        ValueError: the field does not match the surface, or has NaN or infinite values.
+        MeshError: the relief is so high that faces degenerate.
     """
     from ._output import texture
 
-    values = _fitting(surface, u)
+    values = _checked_field(surface, u)
     if not np.isfinite(values).all():
-        raise ValueError(f"Expected finite values, found {values[~np.isfinite(values)][0]}.")
+        vertex = int(np.argmin(np.isfinite(values)))
+        raise ValueError(f"Expected finite values, found {values[vertex]} at vertex {vertex}. Correct it first.")
     vertices, normals = (np.asarray(array, np.float64) for array in (surface.vertices, surface.normals))
     relief = texture.displaced(vertices, normals, values, amount) + surface.centre
     return Mesh(relief, np.asarray(surface.faces))
 
 
 def plot_dispersion(dispersion: Dispersion, eigenvalues: AnyArray | None = None, axes: Any = None) -> Any:
-    """The growth rate against the eigenvalue of -Delta, as matplotlib axes (host).
+    """A plot of the growth rate as a function of the eigenvalue of -Delta, as matplotlib axes (host).
 
     Args:
-        dispersion: what `dispersion` returned, or the one of `explain`.
-        eigenvalues: of the surface, such as ``ltl.eigenmodes(surface, 60).values``; marked on the curve.
-        axes: matplotlib axes to draw into; new ones by default.
+        dispersion: result of `dispersion`, or the attribute ``dispersion`` of the result of `explain`.
+        eigenvalues: eigenvalues of the surface to mark on the curve, such as ``ltl.eigenmodes(surface, 60).values``.
+        axes: matplotlib axes to draw into; by default, new axes.
     """
     import matplotlib.pyplot as plt
 
@@ -129,15 +131,16 @@ def plot_dispersion(dispersion: Dispersion, eigenvalues: AnyArray | None = None,
     axes.axhline(0, color="gray", linewidth=0.8)
     axes.plot(curve, dispersion.growth(curve))
     if eigenvalues is not None:
-        marked = np.asarray(eigenvalues)
-        marked = marked[marked <= curve[-1]]
-        axes.plot(marked, dispersion.growth(marked), "o", markersize=4, label="modes of the surface")
+        modes = np.asarray(eigenvalues)
+        modes = modes[modes <= curve[-1]]
+        axes.plot(modes, dispersion.growth(modes), "o", markersize=4, label="modes of the surface")
         axes.legend()
     axes.set(xlabel="eigenvalue of -Δ", ylabel="growth rate")
     return axes
 
 
-def _fitting(surface: Surface, u: Any) -> np.ndarray:
+def _checked_field(surface: Surface, u: Any) -> np.ndarray:
+    """The field as a float64 array (V,)."""
     values = np.asarray(u, np.float64)
     if values.shape != (surface.num_vertices,):
         raise ValueError(f"Expected a field of shape ({surface.num_vertices},), found {values.shape}.")

@@ -1,4 +1,4 @@
-"""The exceptions and warnings of ltljax."""
+"""The exceptions and warnings of ltljax, to catch or filter by name."""
 
 from ._base.folder import OutputError
 from ._fit import FitError

@@ -1,6 +1,4 @@
-"""Meshes of standard shapes: sphere, ellipsoid, torus, disk, hemisphere, square, cylinder, box, and irregular
-meshes of the sphere and the torus for tests of convergence.
-"""
+"""Meshes of standard shapes, and random or jittered meshes to measure accuracy on irregular meshes."""
 
 from ._mesh.shapes import (
     box,

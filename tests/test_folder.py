@@ -1,4 +1,4 @@
-"""What ltljax replaces and removes in a folder is its own, whatever else lies there."""
+"""ltljax replaces and removes only its own files in a folder of results."""
 
 import json
 import subprocess
@@ -26,7 +26,7 @@ def tree(path):
     return {entry.relative_to(path).as_posix(): entry.read_bytes() for entry in path.rglob("*") if entry.is_file()}
 
 
-def test_what_was_written_is_owned_until_it_changes(tmp_path):
+def test_a_file_is_owned_until_it_changes(tmp_path):
     folder = written(tmp_path, a="1", b="2")
     assert sorted(owned(folder)) == ["a", "b"]
     written(tmp_path, a="3")
@@ -43,29 +43,29 @@ def test_what_was_written_is_owned_until_it_changes(tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == [".ltljax", "a"]
 
 
-def test_a_folder_of_nothing_else_goes_with_its_files(tmp_path):
+def test_an_empty_folder_is_removed_with_its_files(tmp_path):
     folder = written(tmp_path / "out", a="1")
     with folder.locked():
         folder.remove_itself()
     assert not (tmp_path / "out").exists()
 
 
-def test_results_stay_as_they_are_where_new_ones_cannot_be_completed(tmp_path):
+def test_results_do_not_change_if_new_results_are_incomplete(tmp_path):
     folder = written(tmp_path, a="1", b="2")
     before = tree(tmp_path)
 
-    def on_a_full_disk():
+    def write_to_a_full_disk():
         with folder.locked(), folder.draft() as draft:
             (draft / "a").write_text("new")
             raise OSError("The disk is full.")
 
     with pytest.raises(OSError, match="full"):
-        on_a_full_disk()
+        write_to_a_full_disk()
     assert tree(tmp_path) == before
 
 
 @pytest.mark.parametrize("kind", ["file", "link", "folder"])
-def test_nothing_foreign_is_replaced_whatever_it_is(tmp_path, kind):
+def test_files_links_and_folders_of_the_user_are_not_replaced(tmp_path, kind):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("mine")
     out = tmp_path / "out"
@@ -87,7 +87,7 @@ def test_nothing_foreign_is_replaced_whatever_it_is(tmp_path, kind):
 @pytest.mark.parametrize(
     "content", ["", "{", "[]", '{"files": {}}', '{"ltljax": 2, "files": {}, "drafts": []}', "[" * 9999]
 )
-def test_a_manifest_of_something_else_is_refused_and_kept(tmp_path, content):
+def test_an_invalid_manifest_is_rejected_and_not_changed(tmp_path, content):
     (tmp_path / ".ltljax").mkdir()
     (tmp_path / ".ltljax" / "manifest.json").write_text(content)
     with pytest.raises(OutputError, match=r"manifest\.json"):
@@ -95,7 +95,7 @@ def test_a_manifest_of_something_else_is_refused_and_kept(tmp_path, content):
     assert (tmp_path / ".ltljax" / "manifest.json").read_text() == content
 
 
-def test_a_draft_named_in_a_manifest_never_leads_out_of_the_folder(tmp_path):
+def test_a_draft_outside_the_folder_is_rejected(tmp_path):
     (tmp_path / "mine").mkdir()
     manifest = dict(ltljax=1, files={}, drafts=["../mine"])
     (tmp_path / ".ltljax").mkdir()
@@ -105,29 +105,29 @@ def test_a_draft_named_in_a_manifest_never_leads_out_of_the_folder(tmp_path):
     assert (tmp_path / "mine").exists()
 
 
-def test_one_program_writes_at_a_time_and_a_dead_one_holds_nothing(tmp_path):
+def test_one_program_writes_at_a_time_and_a_killed_program_releases_its_lock(tmp_path):
     code = (
         "import sys; from ltljax._base.folder import Folder\n"
         "with Folder(sys.argv[1]).locked() as folder, folder.draft() as draft:\n"
-        "    (draft / 'half').write_text('x'); print('here', flush=True); sys.stdin.read()"
+        "    (draft / 'half').write_text('x'); print('locked', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "here\n"
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "locked\n"
         with pytest.raises(OutputError, match="Another run is writing"):
             written(tmp_path, a="1")
-        other.kill()
+        process.kill()
     written(tmp_path, a="1")
     assert sorted(tree(tmp_path)) == [".ltljax/lock", ".ltljax/manifest.json", "a"]
 
 
-def test_threads_that_wait_write_one_after_another(tmp_path):
+def test_waiting_threads_write_one_after_another(tmp_path):
     def write(name):
         folder = Folder(tmp_path)
-        for turn in range(10):
+        for count in range(10):
             with folder.locked(waits=True):
-                folder.write(name, f"{turn}".encode())
+                folder.write(name, f"{count}".encode())
 
     threads = [threading.Thread(target=write, args=(f"{name}",)) for name in range(8)]
     for thread in threads:
@@ -138,7 +138,7 @@ def test_threads_that_wait_write_one_after_another(tmp_path):
     assert {(tmp_path / name).read_text() for name in owned(Folder(tmp_path))} == {"9"}
 
 
-def test_inputs_are_never_replaced_and_their_copies_stay_apart(tmp_path):
+def test_inputs_are_not_replaced_and_their_copies_are_separate(tmp_path):
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v")
     folder = Folder(tmp_path)
@@ -152,42 +152,41 @@ def test_inputs_are_never_replaced_and_their_copies_stay_apart(tmp_path):
     assert mesh.read_text() == "v"
 
 
-def test_a_disk_that_is_full_twice_leaves_the_file_its_own(tmp_path, monkeypatch):
+def test_a_file_stays_owned_if_the_disk_is_full_twice(tmp_path, monkeypatch):
     folder = written(tmp_path, a="1")
-
-    kept = folder_module._write_through
+    write_through = folder_module._write_through
 
     def full(path, content):
         if "manifest" not in path.name:
             raise OSError(28, "No space left on device")
-        kept(path, content)
+        write_through(path, content)
 
     with folder.locked():
         monkeypatch.setattr(folder_module, "_write_through", full)
         for _ in range(2):
             with pytest.raises(OSError, match="No space"):
                 folder.write("a", b"2")
-        monkeypatch.setattr(folder_module, "_write_through", kept)
+        monkeypatch.setattr(folder_module, "_write_through", write_through)
         assert folder.owns("a")
         folder.write("a", b"3")
     assert (tmp_path / "a").read_text() == "3"
 
 
 @pytest.mark.parametrize("name", ["../mine", "/etc/passwd"])
-def test_a_manifest_never_leads_out_of_its_folder(tmp_path, name):
+def test_a_manifest_with_files_outside_the_folder_is_rejected(tmp_path, name):
     (tmp_path / ".ltljax").mkdir()
     (tmp_path / ".ltljax" / "manifest.json").write_text(json.dumps(dict(ltljax=1, files={name: ["0"]}, drafts=[])))
     with pytest.raises(OutputError, match="was not written by this version"):
         Folder(tmp_path)
 
 
-def test_what_is_in_the_way_of_the_lock_is_named(tmp_path):
+def test_the_error_names_a_file_in_the_way_of_the_lock(tmp_path):
     (tmp_path / ".ltljax").write_text("mine")
     with pytest.raises(OutputError, match=r"\.ltljax"):
         written(tmp_path, a="1")
 
 
-def test_what_a_killed_program_left_unfinished_is_removed(tmp_path):
+def test_unfinished_files_of_a_killed_program_are_removed(tmp_path):
     written(tmp_path, a="1")
     for name in ("draft-0123456789abcdef", "manifest-0123456789abcdef", "mine"):
         (tmp_path / ".ltljax" / name).write_text("x")

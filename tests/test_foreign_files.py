@@ -1,4 +1,4 @@
-"""Whatever lies in a folder of results, every byte that ltljax has not written is still there after every command."""
+"""No command changes a file in a folder of results that ltljax did not write."""
 
 import functools
 import os
@@ -32,7 +32,7 @@ time = 0.1
 
 
 def commands(inputs):
-    """Everything that writes a folder, by name: a call with the folder, which returns an exit code."""
+    """Functions that write results to a folder and return an exit code, by name."""
     mesh = ltl.shapes.icosphere(2)
     files.write_obj(inputs / "mesh.obj", mesh.vertices, mesh.faces)
     (inputs / "mine.toml").write_text(FITTED)
@@ -40,7 +40,7 @@ def commands(inputs):
     np.savez(inputs / "data.npz", u=mesh.vertices[:, 0])
     obj, toml = str(inputs / "mesh.obj"), str(inputs / "mine.toml")
 
-    def kept(folder):
+    def solve(folder):
         surface = ltl.Surface.from_mesh(mesh)
         try:
             ltl.solve(ltl.Diffusion(), surface, surface.vertices[:, 0], 0.1, dt=0.05, checkpoint_dir=folder)
@@ -48,7 +48,7 @@ def commands(inputs):
             return 2
         return 0
 
-    def fitted(folder):
+    def fit(folder):
         def model(params):
             return params["a"] * jnp.arange(5.0)
 
@@ -68,20 +68,16 @@ def commands(inputs):
         "curvature": ["curvature", obj],
         "distance": ["distance", obj, "--from", "0"],
     }
-    made = {name: lambda folder, line=line: main([*line, "--out", str(folder)]) for name, line in lines.items()}
-    return made | {"solve": kept, "ltl.fit": fitted}
+    functions = {name: lambda folder, line=line: main([*line, "--out", str(folder)]) for name, line in lines.items()}
+    return functions | {"solve": solve, "ltl.fit": fit}
 
 
 @functools.cache
 def names_of(inputs, name):
-    """What a command writes into an empty folder, besides its manifest and its lock."""
+    """The names of the results that a command writes to an empty folder."""
     folder = inputs / f"empty-{name}"
     assert commands(inputs)[name](folder) == 0
     return {path for path in tree(folder) if not path.startswith(".ltljax/")}
-
-
-def all_names(inputs):
-    return set().union(*(names_of(inputs, name) for name in ALL))
 
 
 def tree(folder):
@@ -89,7 +85,7 @@ def tree(folder):
 
 
 def seeded(folder, names, seed):
-    """200 files of somebody else, with these names among them."""
+    """The contents by name of 200 new files of the user, some of which have the given names."""
     random = np.random.default_rng(seed)
     used = [f"restart/state_{number:06d}.npz" for number in range(40)]
     used += [f"state_{number:06d}.npz" for number in range(40)] + ["unknowns.npz", "restart/unknowns.npz", "run.json"]
@@ -101,9 +97,9 @@ def seeded(folder, names, seed):
         "notes.txt",
         "state_000000.unfinished",
     ]
-    wanted = [*names, *random.permutation(used)]
-    wanted += [f"{random.integers(1 << 30)}.{ending}" for ending in ("npz", "json", "vtp", "png") for _ in range(50)]
-    for name in list(dict.fromkeys(wanted))[:200]:
+    all_names = [*names, *random.permutation(used)]
+    all_names += [f"{random.integers(1 << 30)}.{suffix}" for suffix in ("npz", "json", "vtp", "png") for _ in range(50)]
+    for name in list(dict.fromkeys(all_names))[:200]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(random.bytes(random.integers(0, 200)))
     return tree(folder)
@@ -114,12 +110,19 @@ def inputs(tmp_path_factory):
     return tmp_path_factory.mktemp("inputs")
 
 
-ALL = ["run", "run a file", "fit", "denoise", "smooth", "lic", "curvature", "distance", "solve", "ltl.fit"]
+# The slow commands write their results with the same functions as the others.
+QUICK, SLOW = ["run a file", "smooth", "solve", "ltl.fit"], ["run", "fit", "denoise", "lic", "curvature", "distance"]
+COMMANDS = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_a_folder_full_of_foreign_files_is_refused_and_stays(inputs, tmp_path, capsys, name):
-    before = seeded(tmp_path, sorted(all_names(inputs)), 1)
+def names_of_some(inputs, name):
+    """The names of the results of a command and of the quick commands."""
+    return set().union(*(names_of(inputs, command) for command in {*QUICK, name}))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_folder_full_of_user_files_is_rejected_and_not_changed(inputs, tmp_path, capsys, name):
+    before = seeded(tmp_path, sorted(names_of_some(inputs, name)), 1)
     assert len(before) == 200
     capsys.readouterr()
     assert commands(inputs)[name](tmp_path) == 2
@@ -128,8 +131,8 @@ def test_a_folder_full_of_foreign_files_is_refused_and_stays(inputs, tmp_path, c
     assert {path for path in after.keys() - before.keys() if not path.startswith(".ltljax/")} == set()
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_each_name_alone_is_refused_by_its_name(inputs, tmp_path, capsys, name):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_error_names_the_file_in_the_way(inputs, tmp_path, capsys, name):
     for index, own in enumerate(sorted(names_of(inputs, name))):
         folder = tmp_path / str(index)
         (folder / own).parent.mkdir(parents=True)
@@ -141,16 +144,16 @@ def test_each_name_alone_is_refused_by_its_name(inputs, tmp_path, capsys, name):
             assert os.path.basename(own) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_foreign_files_of_other_names_stay_beside_the_results(inputs, tmp_path, name):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_user_files_of_other_names_stay_beside_the_results(inputs, tmp_path, name):
     own = names_of(inputs, name)
-    others = all_names(inputs) - own
+    others = names_of_some(inputs, name) - own
     folders = {path.split("/")[0] for path in own if "/" in path}
-    before = seeded(tmp_path, sorted(other for other in others if other.split("/")[0] not in folders), 2)
-    mine = {path for path in before if path in own or path.startswith(("restart/", "state_", "run.json"))}
-    for path in mine | {path for path in before if path in ("unknowns.npz",)}:
-        (tmp_path / path).unlink()
-        del before[path]
+    before = seeded(tmp_path, sorted(path for path in others if path.split("/")[0] not in folders), 2)
+    for path in list(before):
+        if path in own or path == "unknowns.npz" or path.startswith(("restart/", "state_", "run.json")):
+            (tmp_path / path).unlink()
+            del before[path]
     assert commands(inputs)[name](tmp_path) == 0
     after = tree(tmp_path)
     assert {path: after[path] for path in before} == before

@@ -1,4 +1,4 @@
-"""An argument of the wrong kind is answered by what was expected, not by what Python tripped over."""
+"""The error for an argument of the wrong type says what was expected."""
 
 import inspect
 
@@ -17,10 +17,10 @@ def surface():
 
 
 def functions_of_a_surface():
-    for room in (ltl, ltl.imaging):
-        for name in room.__all__:
-            function = getattr(room, name)
-            # Pictures are drawn of a mesh too.
+    for module in (ltl, ltl.imaging):
+        for name in module.__all__:
+            function = getattr(module, name)
+            # plot and view accept a mesh too.
             if inspect.isroutine(function) and name not in ("plot", "view"):
                 parameters = list(inspect.signature(function).parameters.values())
                 if any(parameter.name == "surface" for parameter in parameters):
@@ -28,11 +28,11 @@ def functions_of_a_surface():
 
 
 @pytest.mark.parametrize(("function", "parameters"), list(functions_of_a_surface()))
-def test_a_mesh_in_place_of_a_surface_is_answered_by_how_to_build_one(function, parameters):
+def test_the_error_for_a_mesh_in_place_of_a_surface_shows_how_to_build_a_surface(function, parameters):
     required = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
-    given = {p.name: MESH if p.name == "surface" else jnp.zeros(MESH.num_vertices) for p in required}
+    arguments = {p.name: MESH if p.name == "surface" else jnp.zeros(MESH.num_vertices) for p in required}
     with pytest.raises(TypeError, match=r"expected a Surface as surface, found a Mesh\. Build one: ltl\.Surface"):
-        function(**given)
+        function(**arguments)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_a_mesh_in_place_of_a_surface_is_answered_by_how_to_build_one(function, 
         (dict(solver=ltl.RKL2), r"Expected as solver an instance .* found the class RKL2"),
         (dict(adjoint="reverse"), "Expected as adjoint an instance"),
         (dict(t1=(0, 1)), r"Expected t1 as one number, found an array of shape \(2,\)"),
-        (dict(t1="1"), "Expected t1 as real numbers, found the type <U1"),
+        (dict(t1="1"), "Expected t1 as real numbers, found type <U1"),
         (dict(t1=None), "Expected t1 as real numbers, found None"),
         (dict(dt=(0.1,)), r"Expected dt as one number"),
         (dict(rtol="fine"), "Expected rtol as real numbers"),
@@ -55,10 +55,10 @@ def test_a_mesh_in_place_of_a_surface_is_answered_by_how_to_build_one(function, 
         (dict(u0=None), "Expected u0 as real numbers, found None"),
     ],
 )
-def test_solve_says_what_it_expected(surface, change, message):
-    given = dict(equation=ltl.Diffusion(), surface=surface, u0=surface.vertices[:, 0], t1=0.1)
+def test_errors_of_solve_say_what_was_expected(surface, change, message):
+    arguments = dict(equation=ltl.Diffusion(), surface=surface, u0=surface.vertices[:, 0], t1=0.1)
     with pytest.raises((TypeError, ValueError), match=message):
-        ltl.solve(**(given | change))
+        ltl.solve(**(arguments | change))
 
 
 @pytest.mark.parametrize(
@@ -73,16 +73,16 @@ def test_solve_says_what_it_expected(surface, change, message):
         (lambda s: ltl.poisson(s, lambda x: x), "as real numbers, found a function"),
         (lambda s: ltl.eigenmodes(s, 3.5), "Expected a whole number of modes, found 3.5"),
         (lambda s: ltl.geodesic_distance(s, 0.5), "Expected the numbers of source vertices"),
-        (lambda s: ltl.load_mesh(MESH), "Expected the path of a file, found a Mesh. Use it as it is"),
+        (lambda s: ltl.load_mesh(MESH), "Expected the path of a file, found a Mesh. It needs no loading"),
         (lambda s: ltl.load_mesh(None), "Expected the path of a file, found a NoneType"),
     ],
 )
-def test_other_functions_say_what_they_expected(surface, call, message):
+def test_errors_of_other_functions_say_what_was_expected(surface, call, message):
     with pytest.raises((TypeError, ValueError), match=message):
         call(surface)
 
 
-def test_a_boundary_function_of_one_argument_is_answered_by_its_two():
+def test_the_error_for_a_boundary_function_of_a_single_argument_shows_its_signature():
     disk = ltl.Surface.from_mesh(ltl.shapes.disk(rings=4))
     equation = ltl.Diffusion(1.0, boundary=ltl.Dirichlet(lambda t: 1.0))
     with pytest.raises(TypeError, match=r"a function \(t, vertices\) -> array, found a function \(t\)"):

@@ -1,4 +1,4 @@
-"""Shapes are the surfaces their formulas say: on them, oriented outwards, with exact normals, converging areas."""
+"""Shapes lie on the surfaces of their formulas, face outwards, and have exact normals and converging areas."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy.special import ellipeinc, ellipkinc
 
 from ltljax._mesh import Mesh, MeshError, shapes
 
-# By name: a mesh at resolution n, the area, the Euler number, the lengths of the boundary loops in edges.
+# For each shape: the mesh at resolution n, the area, the Euler number, and the numbers of edges of the boundary loops.
 SHAPES = {
     "icosphere": (lambda n: shapes.icosphere(n + 1, radius=1.5), 9 * np.pi, 2, lambda n: []),
     "ellipsoid": (lambda n: shapes.ellipsoid((3.0, 2.0, 1.0), n + 2), None, 2, lambda n: []),
@@ -19,7 +19,7 @@ SHAPES = {
 
 
 def ellipsoid_area(a: float, b: float, c: float) -> float:
-    """The area for a >= b >= c in elliptic integrals (Legendre)."""
+    """The area of an ellipsoid with a >= b >= c by elliptic integrals (Legendre)."""
     phi = np.arccos(c / a)
     m = a**2 * (b**2 - c**2) / (b**2 * (a**2 - c**2))
     parts = ellipeinc(phi, m) * np.sin(phi) ** 2 + ellipkinc(phi, m) * np.cos(phi) ** 2
@@ -27,7 +27,7 @@ def ellipsoid_area(a: float, b: float, c: float) -> float:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_euler_number_and_boundary_are_those_of_the_surface(name):
+def test_shapes_have_the_topology_of_the_surface(name):
     make, _, euler_number, loops = SHAPES[name]
     for n in (0, 1, 2):
         report = make(n).report
@@ -38,7 +38,7 @@ def test_euler_number_and_boundary_are_those_of_the_surface(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_areas_converge_with_second_order(name):
+def test_areas_converge_at_second_order(name):
     make, area, _, _ = SHAPES[name]
     area = ellipsoid_area(3.0, 2.0, 1.0) if area is None else area
     errors = [abs(make(n).area / area - 1) for n in (1, 2, 3)]
@@ -48,7 +48,7 @@ def test_areas_converge_with_second_order(name):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_normals_are_unit_and_agree_with_the_faces(name):
+def test_normals_are_unit_vectors_and_agree_with_the_faces(name):
     mesh = SHAPES[name][0](2)
     assert mesh.normals is not None
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-14)
@@ -79,7 +79,7 @@ def test_the_icosphere_has_its_known_number_of_vertices(subdivisions, vertices):
     assert mesh.report.min_valence == 5
 
 
-def test_the_torus_follows_its_formula_in_its_order():
+def test_the_vertices_of_the_torus_follow_the_documented_formula_and_order():
     mesh = shapes.torus()
     assert mesh.num_vertices == 96 * 48
     i, j = 17, 5
@@ -89,7 +89,7 @@ def test_the_torus_follows_its_formula_in_its_order():
     assert (mesh.report.min_valence, mesh.report.max_valence) == (6, 6)
 
 
-def test_boundaries_lie_exactly_where_they_should():
+def test_boundaries_lie_exactly_on_the_boundary_of_the_surface():
     disk = shapes.disk(2.0, 7)
     np.testing.assert_allclose(np.linalg.norm(disk.vertices[disk.boundary_vertices], axis=1), 2, rtol=1e-15)
     assert disk.num_vertices == 1 + 3 * 7 * 8
@@ -132,7 +132,7 @@ def test_irregular_meshes_lie_on_their_surface_with_exact_normals(make):
 @pytest.mark.parametrize(
     "make", [shapes.random_sphere, shapes.jittered_sphere, shapes.jittered_torus, lambda seed: disturbed(seed)]
 )
-def test_the_seed_decides(make):
+def test_equal_seeds_give_equal_meshes(make):
     np.testing.assert_array_equal(make(seed=1).vertices, make(seed=1).vertices)
     assert np.any(make(seed=1).vertices != make(seed=2).vertices)
 
@@ -148,7 +148,7 @@ def test_jitter_moves_inner_vertices_in_the_tangent_plane_only():
     assert np.all(shift[:, 2] == 0)
     length = np.linalg.norm(shift[~disk.boundary_vertices], axis=1)
     assert 0 < length.min() < length.max() <= 0.2 * disk.mesh_size
-    # Uniform in the disc: the mean square of the radius is half of the largest.
+    # For a uniform distribution in a disk, the mean squared radius is half the largest.
     many = shapes.jittered(shapes.disk(rings=40), 0.2, 1).vertices - shapes.disk(rings=40).vertices
     inner = ~shapes.disk(rings=40).boundary_vertices
     reach = 0.2 * shapes.disk(rings=40).mesh_size
@@ -156,15 +156,15 @@ def test_jitter_moves_inner_vertices_in_the_tangent_plane_only():
     np.testing.assert_array_equal(moved.faces, disk.faces)
 
 
-def test_jitter_projects_back_onto_the_surface():
+def test_jitter_projects_vertices_back_onto_the_surface():
     half = shapes.hemisphere(rings=6)
-    bare = Mesh(half.vertices, half.faces)  # without exact normals, those of the faces serve
-    for mesh in (half, bare):
+    without_normals = Mesh(half.vertices, half.faces)  # jittered then uses the face normals
+    for mesh in (half, without_normals):
         moved = shapes.jittered(mesh, 0.2, 0, lambda x: x / np.linalg.norm(x, axis=1, keepdims=True))
         np.testing.assert_allclose(np.linalg.norm(moved.vertices, axis=1), 1, atol=1e-14)
 
 
-def test_jitter_of_nothing_changes_nothing():
+def test_jitter_by_zero_changes_nothing():
     np.testing.assert_allclose(
         np.sort(shapes.jittered_sphere(2, 0.0).vertices, axis=0),
         np.sort(shapes.icosphere(2).vertices, axis=0),
@@ -198,14 +198,14 @@ def test_jitter_of_nothing_changes_nothing():
         (lambda: shapes.jittered(shapes.disk(), amount=float("nan")), "amount must be finite"),
     ],
 )
-def test_bad_arguments_are_value_errors_that_name_them(make, message):
+def test_errors_name_the_invalid_argument(make, message):
     with pytest.raises(ValueError, match=message) as caught:
         make()
     assert not isinstance(caught.value, MeshError)
 
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (1.0, 2.0, 0.5)])
-def test_a_box_has_its_sides(sides):
+def test_a_box_has_the_given_sides(sides):
     mesh = shapes.box(sides, n=8)
     a, b, c = sides
     assert mesh.is_closed

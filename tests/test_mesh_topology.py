@@ -1,4 +1,4 @@
-"""Rings are the faces, in order; k-rings are breadth-first search; loops, edges and components are complete."""
+"""One-rings list the faces in order, k-rings agree with breadth-first search, and edges and loops are complete."""
 
 import time
 
@@ -24,50 +24,50 @@ def two_poles(valence: int) -> Mesh:
     angle = 2 * np.pi * np.arange(valence) / valence
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(valence)], axis=1)
     i = np.arange(valence)
-    after = (i + 1) % valence
-    up = np.stack([i, after, np.full(valence, valence)], axis=1)
-    down = np.stack([after, i, np.full(valence, valence + 1)], axis=1)
+    following = (i + 1) % valence
+    up = np.stack([i, following, np.full(valence, valence)], axis=1)
+    down = np.stack([following, i, np.full(valence, valence + 1)], axis=1)
     return Mesh(np.concatenate([rim, [[0, 0, 1]], [[0, 0, -1]]]), np.concatenate([up, down]))
 
 
-def assert_rings_are_the_mesh(mesh: Mesh, rings: OneRings) -> None:
+def assert_rings_match(mesh: Mesh, rings: OneRings) -> None:
     vertex = np.repeat(np.arange(mesh.num_vertices), rings.valences)
     has_face = rings.successors != vertex
-    # Exactly the mesh's faces, each seen once from each of its corners, in its orientation.
-    seen = np.stack([vertex, rings.neighbours, rings.successors], axis=1)[has_face]
+    # The rings contain each face once for each of its corners, with its orientation.
+    ring_faces = np.stack([vertex, rings.neighbours, rings.successors], axis=1)[has_face]
     rolled = np.concatenate([np.roll(mesh.faces, -corner, axis=1) for corner in range(3)])
-    np.testing.assert_array_equal(seen[np.lexsort(seen.T)], rolled[np.lexsort(rolled.T)])
-    # Exactly the mesh's edges, each from both ends.
-    both = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
+    np.testing.assert_array_equal(ring_faces[np.lexsort(ring_faces.T)], rolled[np.lexsort(rolled.T)])
+    # The rings contain each edge once for each of its ends.
+    directed = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
     pairs = np.stack([vertex, rings.neighbours], axis=1)
-    np.testing.assert_array_equal(pairs[np.lexsort(pairs.T)], both[np.lexsort(both.T)])
-    # Slot by slot the faces follow each other, and the faceless slot is the last one of a boundary vertex.
+    np.testing.assert_array_equal(pairs[np.lexsort(pairs.T)], directed[np.lexsort(directed.T)])
+    # The face of each slot is followed by that of the next, and the last slot of a boundary vertex has no face.
     first, last = rings.offsets[:-1], rings.offsets[1:] - 1
     is_last = np.zeros(len(vertex), bool)
     is_last[last] = True
     np.testing.assert_array_equal(rings.successors[~is_last], rings.neighbours[1:][~is_last[:-1]])
-    closes = np.where(mesh.boundary_vertices, np.arange(mesh.num_vertices), rings.neighbours[first])
-    np.testing.assert_array_equal(rings.successors[last], closes)
+    expected = np.where(mesh.boundary_vertices, np.arange(mesh.num_vertices), rings.neighbours[first])
+    np.testing.assert_array_equal(rings.successors[last], expected)
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_one_rings_are_exactly_the_faces_in_cyclic_order(name):
+def test_one_rings_contain_the_faces_in_cyclic_order(name):
     mesh = SHAPES[name]
-    assert_rings_are_the_mesh(mesh, one_rings(mesh.faces, mesh.num_vertices))
+    assert_rings_match(mesh, one_rings(mesh.faces, mesh.num_vertices))
 
 
 @given(st.integers(0, 10**6), st.integers(6, 60), st.integers(0, 10))
 @settings(max_examples=30, deadline=None)
-def test_one_rings_of_random_surfaces_with_holes(seed, num_vertices, holes):
+def test_one_rings_are_complete_on_random_surfaces_with_holes(seed, num_vertices, holes):
     random = np.random.default_rng(seed)
     full = shapes.random_sphere(num_vertices, seed)
-    keep = random.permutation(full.num_faces)[holes:]
+    remaining = random.permutation(full.num_faces)[holes:]
     try:
-        mesh = Mesh(full.vertices, full.faces[keep])
-    except ValueError:  # the holes touch at a vertex, or too little is left
+        mesh = Mesh(full.vertices, full.faces[remaining])
+    except ValueError:  # the holes touch at a vertex, or too few vertices remain
         return
-    assert_rings_are_the_mesh(mesh, one_rings(mesh.faces, mesh.num_vertices))
-    # Every face has three edges; inner edges have two faces, those of the loops one.
+    assert_rings_match(mesh, one_rings(mesh.faces, mesh.num_vertices))
+    # Every face has three edges; inner edges have two faces, and boundary edges have one.
     assert 3 * mesh.num_faces == 2 * len(mesh.edges) - sum(map(len, mesh.boundary_loops))
 
 
@@ -79,58 +79,58 @@ def test_one_rings_do_not_depend_on_the_order_of_the_faces(random):
     random.shuffle(order)
     turns = [random.randrange(3) for _ in order]
     faces = np.array([np.roll(mesh.faces[face], turn) for face, turn in zip(order, turns, strict=True)])
-    one, other = one_rings(mesh.faces, mesh.num_vertices), one_rings(faces, mesh.num_vertices)
-    np.testing.assert_array_equal(one.neighbours, other.neighbours)
-    np.testing.assert_array_equal(one.successors, other.successors)
+    rings, shuffled_rings = one_rings(mesh.faces, mesh.num_vertices), one_rings(faces, mesh.num_vertices)
+    np.testing.assert_array_equal(rings.neighbours, shuffled_rings.neighbours)
+    np.testing.assert_array_equal(rings.successors, shuffled_rings.successors)
 
 
-def test_a_pole_of_valence_500_has_its_ring_in_order():
+def test_the_ring_of_a_pole_of_valence_500_is_in_order():
     mesh = two_poles(500)
     rings = one_rings(mesh.faces, mesh.num_vertices)
     assert rings.valences.max() == 500
-    assert_rings_are_the_mesh(mesh, rings)
+    assert_rings_match(mesh, rings)
     north = rings.neighbours[rings.offsets[500] : rings.offsets[501]]
     np.testing.assert_array_equal(north, np.arange(500))  # counter-clockwise from above
     south = rings.neighbours[rings.offsets[501] : rings.offsets[502]]
     np.testing.assert_array_equal(south, np.roll(np.arange(500)[::-1], 1))
 
 
-def test_rings_turn_counter_clockwise_seen_from_outside():
+def test_rings_are_counter_clockwise_seen_from_outside():
     mesh = SHAPES["random"]
     rings = one_rings(mesh.faces, mesh.num_vertices)
     vertex = np.repeat(np.arange(mesh.num_vertices), rings.valences)
-    out, ahead, third = mesh.vertices[vertex], mesh.vertices[rings.neighbours], mesh.vertices[rings.successors]
-    assert np.all(np.sum(out * np.cross(ahead - out, third - out), axis=1) > 0)
+    a, b, c = mesh.vertices[vertex], mesh.vertices[rings.neighbours], mesh.vertices[rings.successors]
+    assert np.all(np.sum(a * np.cross(b - a, c - a), axis=1) > 0)
 
 
-def test_rings_of_touching_fans_are_refused():
-    with pytest.raises(ValueError, match="faces around vertex 0 do not form one fan"):
+def test_rings_of_touching_fans_are_rejected():
+    with pytest.raises(ValueError, match="faces around vertex 0 do not form a single fan"):
         one_rings(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5], [0, 5, 6]]), 7)
-    with pytest.raises(ValueError, match="do not form one fan"):
+    with pytest.raises(ValueError, match="do not form a single fan"):
         one_rings(np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [0, 4, 5], [0, 5, 6], [0, 6, 4]]), 7)
 
 
 def breadth_first(neighbours: list[set[int]], start: int, k: int) -> list[int]:
     reached, front = {start}, {start}
     for _ in range(k):
-        front = {other for vertex in front for other in neighbours[vertex]} - reached
+        front = {neighbour for vertex in front for neighbour in neighbours[vertex]} - reached
         reached |= front
     return sorted(reached - {start})
 
 
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("k", [1, 2, 3])
-def test_k_rings_are_breadth_first_search(name, k):
+def test_k_rings_agree_with_breadth_first_search(name, k):
     mesh = SHAPES[name]
     neighbours: list[set[int]] = [set() for _ in range(mesh.num_vertices)]
     for a, b in mesh.edges.tolist():
         neighbours[a].add(b)
         neighbours[b].add(a)
-    asked = np.random.default_rng(k).integers(mesh.num_vertices, size=20)  # in any order, with repetitions
+    vertices = np.random.default_rng(k).integers(mesh.num_vertices, size=20)  # in any order, with repetitions
     for source in (mesh.faces, one_rings(mesh.faces, mesh.num_vertices)):
-        offsets, indices = k_ring(source, mesh.num_vertices, asked, k)
+        offsets, indices = k_ring(source, mesh.num_vertices, vertices, k)
         rows = [row.tolist() for row in np.split(indices, offsets[1:-1])]
-        assert rows == [breadth_first(neighbours, vertex, k) for vertex in asked.tolist()]
+        assert rows == [breadth_first(neighbours, vertex, k) for vertex in vertices.tolist()]
         assert indices.dtype == np.int32
 
 
@@ -141,7 +141,7 @@ def test_k_rings_of_no_vertices_are_empty():
     assert len(indices) == 0
 
 
-def test_the_one_ring_is_the_k_ring_of_one():
+def test_the_k_ring_for_k_equal_to_one_is_the_one_ring():
     mesh = SHAPES["disk"]
     rings = one_rings(mesh.faces, mesh.num_vertices)
     offsets, indices = k_ring(mesh.faces, mesh.num_vertices, np.arange(mesh.num_vertices), 1)
@@ -158,7 +158,7 @@ def test_edges_are_unique_and_sorted():
     assert unique_edges(np.zeros((0, 3), int)).shape == (0, 2)
 
 
-def test_boundary_loops_keep_the_surface_on_their_left():
+def test_boundary_loops_have_the_surface_on_the_left():
     mesh = shapes.disk(rings=5)
     (loop,) = mesh.boundary_loops
     assert loop.dtype == np.int32
@@ -179,7 +179,7 @@ def test_components_are_numbered_by_their_first_vertices():
     assert (mesh.report.components, mesh.report.genus, mesh.report.euler_number) == (2, 1, 2)
 
 
-def test_a_large_mesh_takes_little_time():
+def test_a_mesh_of_100000_vertices_takes_less_than_ten_seconds():
     began = time.perf_counter()
     mesh = shapes.torus(n_major=500, n_minor=200)
     rings = one_rings(mesh.faces, mesh.num_vertices)
@@ -195,23 +195,23 @@ def shuffled(mesh: Mesh, seed: int) -> Mesh:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_reordering_renumbers_and_changes_nothing_else(name):
+def test_reordering_changes_only_the_vertex_order(name):
     mesh = shuffled(SHAPES[name], seed=4)
     for new in (mesh.reordered(), mesh.reordered().reordered(), mesh.reordered().scaled(2).scaled(0.5)):
-        back = new.source_order
-        np.testing.assert_array_equal(new.vertices[back], mesh.vertices)
-        np.testing.assert_array_equal(np.argsort(back)[new.faces], mesh.faces)
+        order = new.source_order
+        np.testing.assert_array_equal(new.vertices[order], mesh.vertices)
+        np.testing.assert_array_equal(np.argsort(order)[new.faces], mesh.faces)
         if mesh.normals is not None:
-            np.testing.assert_array_equal(new.normals[back], mesh.normals)
-        # Loops keep their numbers and their beginnings.
+            np.testing.assert_array_equal(new.normals[order], mesh.normals)
+        # The numbers and first vertices of the loops do not change.
         for loop, expected in zip(new.boundary_loops, mesh.boundary_loops, strict=True):
-            np.testing.assert_array_equal(np.argsort(back)[loop], expected)
+            np.testing.assert_array_equal(np.argsort(order)[loop], expected)
         data = np.arange(mesh.num_vertices)
-        np.testing.assert_array_equal(new.pull(data)[back], data)
+        np.testing.assert_array_equal(new.pull(data)[order], data)
         np.testing.assert_array_equal(new.push(new.pull(data)), data)
 
 
-def test_reordering_leads_back_to_a_source_with_welded_and_dropped_vertices():
+def test_push_after_reordering_handles_welded_and_dropped_vertices():
     sphere = shapes.icosphere(1)
     doubled = np.concatenate([sphere.vertices, [[9, 9, 9]], sphere.vertices])
     mesh = Mesh(doubled, np.where(sphere.faces % 2, sphere.faces, sphere.faces + len(sphere.vertices) + 1), weld=True)
@@ -222,7 +222,7 @@ def test_reordering_leads_back_to_a_source_with_welded_and_dropped_vertices():
     assert 0 < np.isnan(pushed).sum() < len(pushed)
 
 
-def test_reordering_brings_neighbours_together():
+def test_reordering_puts_neighbours_close_together():
     mesh = shuffled(shapes.icosphere(5), seed=0)
     before, after = (np.abs(np.diff(m.edges, axis=1)).mean() for m in (mesh, mesh.reordered()))
     assert before > mesh.num_vertices / 4

@@ -13,31 +13,32 @@ from ltljax.app import scenario
 from ltljax.app.cli import main
 
 
-def in_light(colours):
-    screen = colours[:, :3] / 255
-    return np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
+def linear(colours):
+    """Linear colours from sRGB bytes."""
+    srgb = colours[:, :3] / 255
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def test_a_glb_opens_again_with_its_colours(tmp_path):
+def test_a_glb_opens_with_its_colours(tmp_path):
     mesh = ltl.shapes.icosphere(2)
     colours = colors.vertex_colors(mesh.vertices[:, 0], colormap="magma")
     files.write_glb(tmp_path / "ball.glb", mesh.vertices, mesh.faces, colours, mesh.vertices)
     (opened,) = trimesh.load(tmp_path / "ball.glb", process=False).geometry.values()
     np.testing.assert_array_equal(opened.faces, mesh.faces)
     np.testing.assert_allclose(opened.vertices, mesh.vertices, atol=1e-6)
-    np.testing.assert_allclose(opened.visual.vertex_attributes["color"][:, :3], in_light(colours), atol=0.005)
+    np.testing.assert_allclose(opened.visual.vertex_attributes["color"][:, :3], linear(colours), atol=0.005)
     assert ltl.load_mesh(tmp_path / "ball.glb").num_vertices == mesh.num_vertices
 
 
-def test_colours_end_where_their_map_does_and_gaps_are_grey():
-    found = colors.vertex_colors(np.array([0.0, 1.0, np.nan]), colormap="gray")
-    np.testing.assert_array_equal(found, [[0, 0, 0, 255], [255, 255, 255, 255], [128, 128, 128, 255]])
+def test_limits_have_the_end_colours_of_the_map_and_nan_is_grey():
+    colours = colors.vertex_colors(np.array([0.0, 1.0, np.nan]), colormap="gray")
+    np.testing.assert_array_equal(colours, [[0, 0, 0, 255], [255, 255, 255, 255], [128, 128, 128, 255]])
     with pytest.raises(ValueError, match="did you mean plasma"):
         colors.vertex_colors(np.zeros(2), colormap="plasna")
 
 
 def square_with_map(n=8):
-    """A square whose UV map is the square itself, in one chart."""
+    """A square whose texture coordinates are its own coordinates."""
     mesh = ltl.shapes.square(1.0, n)
     flat = mesh.vertices[:, :2] - mesh.vertices[:, :2].min(axis=0)
     return ltl.Mesh(mesh.vertices, mesh.faces, uv=flat[mesh.faces])
@@ -51,11 +52,11 @@ def test_a_linear_field_is_baked_exactly():
     np.testing.assert_allclose(image, centre[None] + 10 * centre[::-1, None], atol=1e-9)
 
 
-def test_places_follow_welding_repair_turning_and_reordering(tmp_path):
+def test_texture_coordinates_follow_welding_repair_reorientation_and_reordering(tmp_path):
     mesh = square_with_map(4)
     lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
     lines += [f"vt {u} {v}" for u, v in mesh.uv.reshape(-1, 2)]
-    # Every second face turned over, one with a corner twice.
+    # Every second face is reversed, and the last face repeats a corner.
     for index, (a, b, c) in enumerate(mesh.faces + 1):
         corners = [(a, 3 * index + 1), (b, 3 * index + 2), (c, 3 * index + 3)]
         lines.append("f " + " ".join(f"{v}/{t}" for v, t in (corners if index % 2 else corners[::-1])))
@@ -69,17 +70,17 @@ def test_places_follow_welding_repair_turning_and_reordering(tmp_path):
         ltl.Mesh(mesh.vertices, mesh.faces, uv=mesh.uv[1:])
 
 
-def torus_with_map():
-    """A torus whose angles are its places: across the seams they go on beyond one."""
-    mesh = ltl.shapes.torus(n_major=60, n_minor=30)
+def torus_with_map(n_major=60, n_minor=30):
+    """A torus whose texture coordinates are its angles; at the seams they exceed one."""
+    mesh = ltl.shapes.torus(n_major=n_major, n_minor=n_minor)
     x, y, z = mesh.vertices.T
-    turns = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - 2)], axis=1) / (2 * np.pi) % 1
-    uv = turns[mesh.faces]
+    angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - 2)], axis=1) / (2 * np.pi) % 1
+    uv = angles[mesh.faces]
     uv += uv.max(axis=1, keepdims=True) - uv > 0.5
     return ltl.Mesh(mesh.vertices, mesh.faces, uv=uv)
 
 
-def test_a_textured_mesh_opens_again_with_the_field_in_its_texture(tmp_path):
+def test_a_textured_mesh_opens_with_the_field_in_its_texture(tmp_path):
     pytest.importorskip("imageio")
     mesh = torus_with_map()
     u = np.sin(4 * mesh.vertices[:, 0])
@@ -89,14 +90,14 @@ def test_a_textured_mesh_opens_again_with_the_field_in_its_texture(tmp_path):
     written = texture.write_textured_obj(tmp_path / "torus.obj", mesh.vertices, mesh.faces, mesh.uv, flat)
     assert [file.suffix for file in written] == [".obj", ".mtl", ".png"]
     opened = trimesh.load(tmp_path / "torus.obj", force="mesh", process=False)
-    places = opened.visual.uv[opened.faces].mean(axis=1)
-    found = np.asarray(opened.visual.material.to_color(places))[:, 0] / 255 * 2 - 1
+    centres = opened.visual.uv[opened.faces].mean(axis=1)
+    values = np.asarray(opened.visual.material.to_color(centres))[:, 0] / 255 * 2 - 1
     expected = np.sin(4 * opened.vertices[opened.faces][..., 0]).mean(axis=1)
-    assert np.abs(found - expected).mean() < 0.03
+    assert np.abs(values - expected).mean() < 0.03
     np.testing.assert_allclose(ltl.load_mesh(tmp_path / "torus.obj").uv, mesh.uv, atol=1e-8)
 
 
-def test_without_a_map_or_with_wrong_shapes_baking_says_so():
+def test_baking_without_a_map_or_with_wrong_shapes_raises():
     mesh = ltl.shapes.icosphere(1)
     with pytest.raises(ValueError, match="no UV map"):
         texture.bake(mesh.uv, mesh.faces, np.zeros(mesh.num_vertices))
@@ -107,7 +108,7 @@ def test_without_a_map_or_with_wrong_shapes_baking_says_so():
         texture.bake(sheet.uv[1:], sheet.faces, np.zeros(sheet.num_vertices))
 
 
-def test_a_map_that_is_tiled_or_not_finite_is_refused():
+def test_a_map_that_is_tiled_or_not_finite_is_rejected():
     sheet = square_with_map(4)
     values = np.zeros(sheet.num_vertices)
     with pytest.raises(ValueError, match="found others in face 0"):
@@ -118,7 +119,7 @@ def test_a_map_that_is_tiled_or_not_finite_is_refused():
         texture.bake(4 * sheet.uv, sheet.faces, values)
 
 
-def test_a_map_far_outside_is_repeated():
+def test_texture_coordinates_are_periodic():
     sheet = square_with_map(4)
     values = sheet.vertices[:, 0]
     np.testing.assert_allclose(
@@ -128,7 +129,7 @@ def test_a_map_far_outside_is_repeated():
     )
 
 
-def test_letters_beyond_ascii_do_not_reach_the_names_inside_an_obj(tmp_path):
+def test_the_names_inside_an_obj_are_ascii(tmp_path):
     pytest.importorskip("imageio")
     sheet = square_with_map(2)
     image = np.zeros((4, 4, 3), np.uint8)
@@ -137,7 +138,7 @@ def test_letters_beyond_ascii_do_not_reach_the_names_inside_an_obj(tmp_path):
     assert opened.visual.material.image.size == (4, 4)
 
 
-def test_a_surface_takes_a_field_as_its_relief():
+def test_the_relief_of_a_field_displaces_the_surface():
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
     z = np.asarray(surface.vertices[:, 2])
     raised = ltl.imaging.displaced(surface, z, 0.5)
@@ -155,7 +156,7 @@ def test_displacement_follows_the_normals():
 
 def test_a_run_on_a_mesh_with_a_map_writes_its_texture(tmp_path):
     pytest.importorskip("pyvista")
-    mesh = torus_with_map()
+    mesh = torus_with_map(24, 12)
     texture.write_textured_obj(
         tmp_path / "donut.obj", mesh.vertices, mesh.faces, mesh.uv, np.zeros((4, 4, 3), np.uint8)
     )
@@ -166,7 +167,7 @@ def test_a_run_on_a_mesh_with_a_map_writes_its_texture(tmp_path):
 
 
 def unwrapped(path, mesh):
-    """An OBJ of a mesh with a UV map in which each face has a cell of its own."""
+    """Write an OBJ whose texture coordinates put each face into a cell of its own."""
     side = int(np.ceil(np.sqrt(mesh.num_faces)))
     column, row = np.arange(mesh.num_faces) % side, np.arange(mesh.num_faces) // side
     corner = np.array([[0.15, 0.15], [0.85, 0.15], [0.15, 0.85]])
@@ -174,7 +175,7 @@ def unwrapped(path, mesh):
     texture.write_textured_obj(path, mesh.vertices, mesh.faces, uv, np.zeros((4, 4, 3), np.uint8))
 
 
-# On each surface a scenario, and what is changed of it.
+# A scenario for each surface, and the settings that differ from its defaults.
 SURFACES = {
     "spot": ("turk", ["--t1", "20", "--set", 'kinetics.decay="11 + 0.1*noise"']),
     "bunny": ("barrio-spots", ["--set", 'diffusivity.u="0.516*0.006"', "--set", "diffusivity.v=0.006"]),
@@ -187,19 +188,19 @@ FILES = {"spot": "spot.obj", "bunny": "bunny_closed.obj", "hand": "hand_open.obj
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SURFACES)
-def test_five_scenarios_on_five_surfaces_show_a_pattern_that_opens_again(name, tmp_path, real_mesh):
+def test_the_pattern_of_a_scenario_appears_in_its_picture_and_files(name, tmp_path, real_mesh):
     pytest.importorskip("pyvista")
     kind, changes = SURFACES[name]
-    given = name
+    mesh = name
     if name in FILES:
-        given = str(tmp_path / f"{name}.obj")
+        mesh = str(tmp_path / f"{name}.obj")
         unwrapped(tmp_path / f"{name}.obj", ltl.load_mesh(real_mesh(FILES[name])))
     if name == "disk":
         changes = [*changes, "--set", "mesh.rings=36"]
     out = tmp_path / "out"
-    assert main(["run", kind, "--mesh", given, "--frames", "2", *changes, "--out", str(out)]) == 0
+    assert main(["run", kind, "--mesh", mesh, "--frames", "2", *changes, "--out", str(out)]) == 0
 
-    # In the picture: a surface of some size on white, in colours from both ends of the map, and a pattern with borders.
+    # The picture shows a surface on a white background, with colours from both ends of the colour map.
     picture = np.asarray(Image.open(out / f"{kind}.png"))[..., :3].astype(float)
     surface = (picture < 250).any(axis=2)
     assert 0.1 < surface.mean() < 0.7
@@ -218,14 +219,14 @@ def test_five_scenarios_on_five_surfaces_show_a_pattern_that_opens_again(name, t
     if name not in FILES:
         return
     opened = trimesh.load(out / "textured" / f"{kind}.obj", force="mesh", process=False)
-    # The texture has the colours of the vertices, in the middle of each face.
-    places = opened.visual.uv[opened.faces].mean(axis=1)
-    baked = np.asarray(opened.visual.material.to_color(places))[:, :3] / 255.0
+    # At the centre of each face, the texture has the mean colour of the vertices.
+    centres = opened.visual.uv[opened.faces].mean(axis=1)
+    baked = np.asarray(opened.visual.material.to_color(centres))[:, :3] / 255.0
     screen = trimesh.load(out / f"{kind}.ply", process=False).visual.vertex_colors[:, :3] / 255.0
     means = screen[glb.faces].mean(axis=1)
-    even = np.ptp(screen[glb.faces], axis=1).max(axis=1) < 0.1
-    assert even.sum() > 100
-    assert np.abs(baked - means)[even].mean() < 0.05
+    is_even = np.ptp(screen[glb.faces], axis=1).max(axis=1) < 0.1
+    assert is_even.sum() > 100
+    assert np.abs(baked - means)[is_even].mean() < 0.05
 
 
 def pyvista_columns(path):

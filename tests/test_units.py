@@ -1,4 +1,4 @@
-"""A change of the unit of a field or of a length changes units, and nothing else."""
+"""Results scale with the units of fields and lengths."""
 
 import warnings
 
@@ -13,7 +13,7 @@ import ltljax as ltl
 
 warnings.filterwarnings("ignore", category=ltl.errors.IncompatibleSourceWarning)
 
-# Powers of ten that fields are multiplied with, and lengths, whose squares have to stay in range too.
+# Largest powers of ten by which fields and lengths are scaled. The squares of lengths must stay in range too.
 FIELDS = {"float32": 25, "float64": 150}
 LENGTHS = {"float32": 14, "float64": 40}
 ROUNDING = {"float32": 3e-5, "float64": 1e-12}
@@ -42,54 +42,75 @@ LINEAR = {
 }
 SURFACES = {name: ltl.Surface.from_mesh(MESH, dtype=jnp.dtype(name)) for name in FIELDS}
 U = X[:, 0] + 0.3 * X[:, 2] ** 2
-AT_ONE = {}
+UNSCALED = {}
 
 
 def in_units(name, dtype, power):
-    """What a linear function makes of a field in units 10^power, in these units."""
+    """The value of a linear function at a field scaled by 10^power, divided by 10^power."""
     unit = jnp.asarray(10.0**power, dtype)
     return np.asarray(LINEAR[name](SURFACES[dtype], unit * jnp.asarray(U, dtype)) / unit)
 
 
-@pytest.mark.parametrize("dtype", FIELDS)
-@pytest.mark.parametrize("name", LINEAR)
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def slow_unless(is_quick, *values):
+    return values if is_quick else slow(*values)
+
+
+# The quick tests run each operator in one type, and the solvers in float32, whose range is smaller.
+QUICK_FUNCTIONS = {
+    ("gradient", "float32"), ("divergence", "float64"), ("laplacian", "float32"), ("laplacian", "float64"),
+    ("hessian", "float64"), ("integral", "float32"), ("vector_laplacian", "float64"), ("poisson", "float32"),
+    ("screened_poisson", "float32"), ("heat, adaptive", "float32"), ("heat, implicit", "float32"),
+}  # fmt: skip
+FUNCTIONS = [slow_unless((name, dtype) in QUICK_FUNCTIONS, name, dtype) for name in LINEAR for dtype in FIELDS]
+QUICK_SCHEMES = (("Monotone", "float32"), ("Polynomial", "float64"), ("Paper", "float32"))
+SCHEMES = [
+    slow_unless((type(scheme).__name__, dtype) in QUICK_SCHEMES, scheme, dtype)
+    for scheme in (ltl.Monotone(), ltl.Polynomial(), ltl.Paper())
+    for dtype in FIELDS
+]
+
+
+@pytest.mark.parametrize(("name", "dtype"), FUNCTIONS)
 @settings(max_examples=3, deadline=None)
 @given(share=st.sampled_from([-1.0, 1.0]) | st.floats(-1, 1))
-def test_the_unit_of_a_field_changes_units_only(name, dtype, share):
-    if (name, dtype) not in AT_ONE:
-        AT_ONE[name, dtype] = in_units(name, dtype, 0)
-    exact, found = AT_ONE[name, dtype], in_units(name, dtype, round(share * FIELDS[dtype]))
-    assert np.max(np.abs(found - exact)) <= ROUNDING[dtype] * np.max(np.abs(exact))
+def test_linear_functions_scale_with_the_unit_of_a_field(name, dtype, share):
+    if (name, dtype) not in UNSCALED:
+        UNSCALED[name, dtype] = in_units(name, dtype, 0)
+    expected, value = UNSCALED[name, dtype], in_units(name, dtype, round(share * FIELDS[dtype]))
+    assert np.max(np.abs(value - expected)) <= ROUNDING[dtype] * np.max(np.abs(expected))
 
 
-@pytest.mark.parametrize("dtype", FIELDS)
-@pytest.mark.parametrize("scheme", [ltl.Monotone(), ltl.Polynomial(), ltl.Paper()], ids=lambda scheme: str(scheme)[:8])
+@pytest.mark.parametrize(("scheme", "dtype"), SCHEMES, ids=lambda value: str(value)[:8])
 @settings(max_examples=2, deadline=None)
 @given(share=st.sampled_from([-1.0, 1.0]) | st.floats(-1, 1))
-def test_the_unit_of_length_changes_units_only(scheme, dtype, share):
+def test_operators_scale_with_the_unit_of_length(scheme, dtype, share):
     factor = 10.0 ** round(share * LENGTHS[dtype])
     u = jnp.asarray(U, dtype)
 
-    def numbers(scale):
+    def results(scale):
         surface = ltl.Surface.from_mesh(MESH.scaled(scale), scheme, dtype=jnp.dtype(dtype))
-        found = [ltl.laplacian(surface, u) * scale**2, ltl.gradient(surface, u) * scale]
-        found += [ltl.integrate(surface, u) / scale**2, ltl.geodesic_distance(surface, 0) / scale]
+        values = [ltl.laplacian(surface, u) * scale**2, ltl.gradient(surface, u) * scale]
+        values += [ltl.integrate(surface, u) / scale**2, ltl.geodesic_distance(surface, 0) / scale]
         if not isinstance(scheme, ltl.Paper):
-            found += [ltl.curvature(surface).mean * scale]
-        return [np.asarray(x, np.float64) for x in found]
+            values += [ltl.curvature(surface).mean * scale]
+        return [np.asarray(x, np.float64) for x in values]
 
-    for found, exact in zip(numbers(factor), numbers(1.0), strict=True):
-        assert np.max(np.abs(found - exact)) <= 10 * ROUNDING[dtype] * np.max(np.abs(exact))
+    for value, expected in zip(results(factor), results(1.0), strict=True):
+        assert np.max(np.abs(value - expected)) <= 10 * ROUNDING[dtype] * np.max(np.abs(expected))
 
 
 @pytest.mark.parametrize("factor", [1e18, 1e-20])
-def test_lengths_whose_weights_leave_the_float_type_are_refused(factor):
+def test_lengths_whose_weights_overflow_or_underflow_are_rejected(factor):
     with pytest.raises(ValueError, match="leave the range of float32"):
         ltl.Surface.from_mesh(MESH.scaled(factor), dtype=jnp.float32)
 
 
-def test_a_mesh_is_not_refused_because_one_block_of_its_weights_is_zero():
-    # If few rows have the same length, all their weights in one component of the Hessian can be zero.
+def test_a_mesh_with_a_block_of_zero_weights_is_accepted():
+    # If few rows have the same length, all their weights in a component of the Hessian can be zero.
     points = np.random.default_rng(0).random((100, 2))
     points = np.concatenate([points, [[0, 0], [1, 0], [0, 1], [1, 1]]])
     mesh = ltl.Mesh(
@@ -99,8 +120,10 @@ def test_a_mesh_is_not_refused_because_one_block_of_its_weights_is_zero():
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e-9, 1.0, 1e9])
-@pytest.mark.parametrize("solver", [None, ltl.TRBDF2(), diffrax.Tsit5()], ids=["default", "TRBDF2", "Tsit5"])
-def test_a_reaction_of_any_size_has_its_closed_form(size, solver):
+@pytest.mark.parametrize(
+    "solver", [None, slow(ltl.TRBDF2()), slow(diffrax.Tsit5())], ids=["default", "TRBDF2", "Tsit5"]
+)
+def test_a_reaction_in_any_unit_matches_its_closed_form(size, solver):
     surface = SURFACES["float64"]
     decay = ltl.ReactionDiffusion((0.0,), lambda species, k: (-(species[0] ** 2) / k,), params=jnp.array(size))
     u0 = jnp.full((surface.num_vertices, 1), size)
@@ -108,26 +131,26 @@ def test_a_reaction_of_any_size_has_its_closed_form(size, solver):
     np.testing.assert_allclose(end, size / 51, rtol=2e-3)
 
 
-@pytest.mark.parametrize("solver", [ltl.RKL2(), ltl.TRBDF2()], ids=["RKL2", "TRBDF2"])
-def test_the_unit_of_one_species_changes_that_species_only(solver):
+@pytest.mark.parametrize("solver", [ltl.RKL2(), slow(ltl.TRBDF2())], ids=["RKL2", "TRBDF2"])
+def test_the_unit_of_a_species_affects_that_species_only(solver):
     surface = SURFACES["float64"]
 
     def ends(unit):
-        def turning(species, unit):
+        def rotation(species, unit):
             u, v = species
             return -2.0 * v / unit - u**3, 2.0 * u * unit - 0.3 * v
 
-        equation = ltl.ReactionDiffusion((0.05, 0.02), turning, params=jnp.array(unit))
+        equation = ltl.ReactionDiffusion((0.05, 0.02), rotation, params=jnp.array(unit))
         u0 = jnp.stack([1 + 0.2 * surface.vertices[:, 0], 0 * surface.vertices[:, 0]], axis=1)
-        found = ltl.solve(equation, surface, u0, 2.0, solver=solver)
-        return found.u_end / jnp.array([[1.0, unit]]), int(found.counts["num_steps"])
+        solution = ltl.solve(equation, surface, u0, 2.0, solver=solver)
+        return solution.u_end / jnp.array([[1.0, unit]]), int(solution.counts["num_steps"])
 
-    (exact, steps), (found, other_steps) = ends(1.0), ends(1e-9)
-    assert other_steps <= 1.3 * steps
-    np.testing.assert_allclose(found, exact, atol=2e-3)
+    (expected, num_steps), (end, num_steps_scaled) = ends(1.0), ends(1e-9)
+    assert num_steps_scaled <= 1.3 * num_steps
+    np.testing.assert_allclose(end, expected, atol=2e-3)
 
 
-def test_heat_in_float32_takes_as_many_steps_in_any_unit():
+def test_the_heat_equation_in_float32_takes_the_same_number_of_steps_in_any_unit():
     surface = SURFACES["float32"]
     u0 = jnp.asarray(U, jnp.float32)
     counts = [
@@ -136,10 +159,10 @@ def test_heat_in_float32_takes_as_many_steps_in_any_unit():
     assert max(counts) == min(counts)
 
 
-def test_a_species_that_starts_at_zero_and_grows_is_followed():
+@pytest.mark.parametrize("solver", [ltl.RKL2(), slow(ltl.TRBDF2())], ids=["RKL2", "TRBDF2"])
+def test_a_species_that_grows_from_zero_is_accurate(solver):
     surface = SURFACES["float64"]
     growing = ltl.ReactionDiffusion((0.0, 0.0), lambda species, _: (-species[0], 1e-9 * species[0]))
     u0 = jnp.zeros((surface.num_vertices, 2)).at[:, 0].set(1.0)
-    for solver in (ltl.RKL2(), ltl.TRBDF2()):
-        end = ltl.solve(growing, surface, u0, 1.0, solver=solver).u_end
-        np.testing.assert_allclose(end[:, 1], 1e-9 * (1 - np.exp(-1)), rtol=1e-3)
+    end = ltl.solve(growing, surface, u0, 1.0, solver=solver).u_end
+    np.testing.assert_allclose(end[:, 1], 1e-9 * (1 - np.exp(-1)), rtol=1e-3)

@@ -1,1 +1,1 @@
-"""What every room uses: checks of arguments, progress, folders of results, records as files."""
+"""Helpers that all other packages use: argument checks, progress, result folders, and records in files."""

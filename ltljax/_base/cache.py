@@ -1,9 +1,9 @@
-"""The one cache of the package: host values that live as long as the array they belong to.
+"""A cache of host values that live as long as the array they belong to.
 
-Surfaces are immutable pytrees, so what is expensive to compute from their weights (a factorization, a multigrid
-hierarchy, the stationary measure) is kept here and not in the record. Entries are found by the identity of an array and
-are dropped when that array is freed. All functions may be called from several threads: the lock is never held while a
-value is computed, so two threads may compute the same value, and the first to finish is the one that is kept.
+Surfaces are immutable pytrees, so values that are expensive to compute from their weights (a factorization, a multigrid
+hierarchy, the stationary measure) are stored here instead of in the surface. Entries are keyed by the identity of an
+array and removed when the array is freed. All functions are thread-safe. The lock is not held while a value is
+computed, so two threads may compute the same value; the cache keeps the value that is ready first.
 """
 
 import itertools
@@ -21,12 +21,12 @@ _next_handle = itertools.count()
 
 
 def remembered(owner: Any, name: str, compute: Callable[[], T]) -> T:
-    """The value of ``compute()``, computed once for this owner and name and kept as long as the owner is alive.
+    """The value of ``compute()``, computed once for an owner and a name and cached until the owner is freed.
 
     Args:
-        owner: an array, which can be referenced weakly.
-        name: what is computed; the same name always stands for the same computation.
-        compute: called if the value is not there.
+        owner: an array, or another object that can be referenced weakly.
+        name: name of the computation; a name always stands for the same computation.
+        compute: function that is called if the value is not in the cache.
     """
     key = id(owner)
     with _lock:
@@ -42,17 +42,17 @@ def remembered(owner: Any, name: str, compute: Callable[[], T]) -> T:
 
 
 def new_handle(value: Any) -> int:
-    """A number by which a compiled program can ask the host for a value: see `value_of` and `release_with`."""
+    """A number by which a compiled program can get a value from the host; see `value_of` and `release_with`."""
     handle = next(_next_handle)
     _handles[handle] = value
     return handle
 
 
 def value_of(handle: int) -> Any:
-    """The value of a handle, or None if it has been released."""
+    """The value of a handle, or None if the handle has been released."""
     return _handles.get(handle)
 
 
 def release_with(handle: int, owner: Any) -> None:
-    """Release a handle when its owner, an array, is freed."""
+    """Release a handle when an array, its owner, is freed."""
     weakref.finalize(owner, _handles.pop, handle, None)

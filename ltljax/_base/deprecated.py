@@ -1,4 +1,4 @@
-"""Old names, kept for one release: each works and raises a `DeprecationWarning` that gives the new name."""
+"""Deprecated names, which still work for one release and warn with a `DeprecationWarning` that gives the new name."""
 
 import functools
 import warnings
@@ -13,13 +13,13 @@ REMOVED_IN = "0.3"
 
 
 def warn_deprecated(old: str, new: str, stacklevel: int = 3) -> None:
-    """Warn that an old name is in use, at the caller's caller by default."""
+    """Warn that a deprecated name is in use; by default, the warning points at the caller's caller."""
     message = f"{old} is deprecated and will be removed in version {REMOVED_IN}: use {new}."
     warnings.warn(message, DeprecationWarning, stacklevel=stacklevel)
 
 
 def renamed_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A decorator that accepts old keyword arguments under their new names.
+    """A decorator that passes deprecated keyword arguments on under their new names.
 
     Example: ``@renamed_arguments(max_steps="max_iterations")``.
     """
@@ -41,7 +41,7 @@ def renamed_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P
 
 
 def deprecated_alias(old: str, new: Callable[P, R]) -> Callable[P, R]:
-    """A function under its old name."""
+    """The function under its deprecated name."""
 
     @functools.wraps(new)
     def alias(*args: P.args, **kwargs: P.kwargs) -> R:

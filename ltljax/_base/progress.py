@@ -1,4 +1,4 @@
-"""What is said on the terminal: how far a long piece of work is, how long its parts took, and what there is to note."""
+"""Output on the terminal: progress bars, notes, and the time that parts of a computation took."""
 
 import contextlib
 import sys
@@ -9,12 +9,12 @@ from typing import Any
 
 
 def watched(what: str, *, progress: bool = True, unit: str = "batch") -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """Hands on the steps it is given and, if asked, shows a bar with the remaining time: of tqdm where that is at hand.
+    """A function that returns an iterable over its steps, with a progress bar (by tqdm, if installed).
 
     Args:
-        what: what is being done.
-        progress: whether to show anything.
-        unit: what a step is.
+        what: description of the work.
+        progress: whether to show the progress bar.
+        unit: name of a step.
     """
 
     def watch(steps: Sequence[Any]) -> Iterable[Any]:
@@ -38,28 +38,34 @@ def _plain(steps: Sequence[Any], what: str) -> Iterator[Any]:
 
 
 def say(what: str, share: float, start: float) -> None:
-    """Print how much of a work is done, and how long the rest will take if it goes on as since the start."""
-    left = (time.perf_counter() - start) * (1 - share) / max(share, 1e-9)
-    print(f"{what}: {100 * share:.0f} %, about {left:.0f} s left", file=sys.stderr)
+    """Print the finished share of the work, and the remaining time if it continues at the same rate.
+
+    Args:
+        what: description of the work.
+        share: finished share of the work, from 0 to 1.
+        start: value of ``time.perf_counter()`` when the work began.
+    """
+    remaining = (time.perf_counter() - start) * (1 - share) / max(share, 1e-9)
+    print(f"{what}: {100 * share:.0f} %, about {remaining:.0f} s left", file=sys.stderr)
 
 
 @contextlib.contextmanager
 def noted(*ignored: type[Warning]) -> Iterator[None]:
-    """Prints the warnings of the work inside as notes, after it, except those of some categories."""
-    with warnings.catch_warnings(record=True) as cautions:
+    """Print the warnings of the ``with`` block as notes when it ends, except those of the ignored categories."""
+    with warnings.catch_warnings(record=True) as recorded:
         warnings.simplefilter("always")
         for category in ignored:
             warnings.simplefilter("ignore", category)
         yield
-    for caution in cautions:
-        print(f"note: {caution.message}")
+    for warning in recorded:
+        print(f"note: {warning.message}")
 
 
 class Laps:
-    """A stopwatch for work in parts.
+    """A stopwatch for a computation in several parts.
 
     Attributes:
-        seconds: how long each part took, in order.
+        seconds: duration of each part by name, in order.
     """
 
     def __init__(self):
@@ -67,7 +73,7 @@ class Laps:
         self._start = time.perf_counter()
 
     def end(self, part: str) -> None:
-        """The end of a part that began with the last one's end."""
+        """Record the end of a part, which began at the end of the previous part."""
         now = time.perf_counter()
         self.seconds[part] = now - self._start
         self._start = now

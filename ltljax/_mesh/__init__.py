@@ -1,7 +1,7 @@
-"""Meshes: a file or arrays become a checked surface.
+"""Triangle meshes, from a file, from arrays or from a built-in shape.
 
-What enters: a mesh file, arrays, or the sizes of a built-in shape. What leaves: a `Mesh`, its report, and the index
-arrays of its topology. Every error that a mesh can cause is raised here. Nothing in this room runs on a device.
+A `Mesh` is checked when it is built, so every error that a mesh can cause is raised here. The package also provides the
+mesh report and the index arrays of the topology. It runs on the host only.
 """
 
 from . import shapes

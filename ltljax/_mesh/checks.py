@@ -1,9 +1,6 @@
-"""Is this a surface, and if not, can it become one? Checks, welding, orientation and repair.
+"""Checks and repairs that turn arbitrary arrays into a manifold, consistently oriented mesh with finite geometry.
 
-What enters: arrays as a user or a file gives them. What leaves: arrays of a manifold, consistently oriented triangle
-mesh with finite geometry, and a record of everything that was done; or a `MeshError`.
-
-The steps work in the numbering of the arrays handed in, so that messages name indices their reader knows. Vertices are
+The checks use the numbering of the arrays passed in, so that messages name indices the user knows. Vertices are
 renumbered once, at the end.
 """
 
@@ -12,39 +9,36 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.sparse.csgraph
-from scipy.spatial import KDTree
 
-from .._base.arguments import not_negative
 from .errors import MeshError
-from .orientation import disagreeing, turned_faces
+from .orientation import conflicting_edges, reversed_faces
 from .report import face_areas, face_edge_lengths
 from .topology import components, half_edges, shared_edges, undirected_keys, used_vertices
+from .welding import welded_vertices
 
-# Weights go with the fourth power of lengths; within this range they, and products of two, stay finite in float64.
+# Weights scale with the fourth power of lengths. In this range the weights and products of two of them stay finite in
+# float64.
 LARGEST_LENGTH, SMALLEST_LENGTH = 1e60, 1e-60
-# A face this thin, area against the square of its longest edge, has no normal that rounding has not made up.
+# If the area of a face, divided by the square of its longest edge, is below this bound, its normal is rounding error.
 THINNEST_FACE = 1e-14
-# Vertices closer than this fraction of the shortest edge at either one are taken as a single vertex split by rounding.
-_TWIN = 1e-4
-# Second derivatives take five neighbours, so every connected piece needs five vertices beside the one in question.
+# Second derivatives at a vertex need five neighbours.
 FEWEST_VERTICES = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Checked:
-    """A mesh that passed, and what was done to it.
+    """The arrays of a mesh that passed all checks, and a record of its repairs.
 
     Attributes:
-        vertices: (V, 3) float64.
-        faces: (F, 3) int32.
-        original_index: (V,) for each vertex, the first vertex handed in that it came from.
-        welded_index: (V_original,) for each vertex handed in, the vertex it became, or -1.
-        original_corner: (F, 3) for each corner of a face, 3 f + j of corner j of the face f handed in.
-        faces_in_file: number of faces handed in.
-        welded_vertices: vertices merged into another.
-        reoriented_faces: faces turned over.
-        repairs: what was mended, one sentence each.
+        vertices: (V, 3) float64 positions.
+        faces: (F, 3) int32 vertex indices.
+        original_index: (V,) first input vertex that was merged into each vertex.
+        welded_index: (V_original,) vertex that each input vertex became, or -1.
+        original_corner: (F, 3) input corner of each corner of a face; corner j of input face f has the number 3 f + j.
+        faces_in_file: number of input faces.
+        welded_vertices: number of vertices merged into another.
+        reoriented_faces: number of faces whose orientation was reversed.
+        repairs: one phrase for each repair.
     """
 
     vertices: np.ndarray
@@ -64,46 +58,40 @@ def check(vertices: Any, faces: Any, *, repair: bool, weld: bool | float) -> Che
     Args:
         vertices: (V, 3) positions.
         faces: (F, 3) vertex indices.
-        repair: mend what can be mended, instead of raising.
+        repair: repair the mesh where possible instead of raising.
         weld: True merges vertices that coincide up to rounding; a distance merges all vertices within it.
 
     Raises:
-        MeshError: with the first thing found wrong.
+        MeshError: a check fails; the message describes the first failure.
     """
     vertices, faces = _as_arrays(vertices, faces)
-    work = _Workpiece(vertices, faces, repair)
-    work.check_indices()
-    work.check_positions()
-    representative = work.merge_vertices(weld)
-    work.check_degenerate()
-    work.check_duplicates()
-    work.check_edges()
-    work.check_fans()
-    work.cut_where_one_sided()
-    work.check_components()
-    reoriented = work.orient()
-    if repair and work.repairs:
-        # What was mended has to pass like anything else. It does unless a repair above is wrong.
-        again = _Workpiece(work.vertices, work.faces, repair=False)
-        again.check_degenerate()
-        again.check_duplicates()
-        again.check_edges()
-        again.check_fans()
-        again.check_components()
-    used = used_vertices(work.faces, len(work.vertices))
-    new_index = np.full(len(work.vertices), -1, dtype=np.int64)
+    checker = _Checker(vertices, faces, repair)
+    checker.check_indices()
+    checker.check_positions()
+    representative = checker.merge_vertices(weld)
+    checker.check_faces()
+    checker.cut_where_one_sided()
+    checker.check_components()
+    reoriented = checker.orient()
+    if repair and checker.repairs:
+        # A repaired mesh must pass the checks too. This fails only if a repair is wrong.
+        recheck = _Checker(checker.vertices, checker.faces, repair=False)
+        recheck.check_faces()
+        recheck.check_components()
+    used = used_vertices(checker.faces, len(checker.vertices))
+    new_index = np.full(len(checker.vertices), -1, dtype=np.int64)
     new_index[used] = np.arange(len(used))
     welded_index = np.where(representative >= 0, new_index[representative], -1)
     return Checked(
-        vertices=work.vertices[used],
-        faces=new_index[work.faces].astype(np.int32),
-        original_index=work.origin[used],
+        vertices=checker.vertices[used],
+        faces=new_index[checker.faces].astype(np.int32),
+        original_index=checker.origin[used],
         welded_index=welded_index,
-        original_corner=work.corners,
+        original_corner=checker.corners,
         faces_in_file=len(faces),
         welded_vertices=int(np.sum((representative >= 0) & (representative != np.arange(len(representative))))),
         reoriented_faces=reoriented,
-        repairs=tuple(work.repairs),
+        repairs=tuple(checker.repairs),
     )
 
 
@@ -112,8 +100,8 @@ def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     for name, array in (("vertices", vertices), ("faces", faces)):
         if isinstance(array, np.ma.MaskedArray):
             raise MeshError(
-                f"Expected {name} as a plain array, found a masked one, whose mask would be lost. Leave out what is "
-                "masked, and the faces there."
+                f"Expected {name} as a plain array, found a masked array, whose mask would be lost. Leave out the "
+                "masked entries and the faces that use them."
             )
     try:
         vertices, faces = np.asarray(vertices), np.asarray(faces)
@@ -123,8 +111,8 @@ def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(f"Vertices must be real numbers, found {vertices.dtype}. Convert them to float64.")
     if faces.size == 0:
         raise MeshError(
-            f"The mesh has no faces (and {len(vertices) if vertices.ndim else 0} vertices). A surface is made of "
-            "triangles: hand in faces (F, 3), or triangulate the points first."
+            f"The mesh has no faces (and {len(vertices) if vertices.ndim else 0} vertices). Pass triangles as faces "
+            "(F, 3), or triangulate the points first."
         )
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(
@@ -136,70 +124,26 @@ def _as_arrays(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"Faces must have the shape (F, 3), found {faces.shape}. Split larger faces into triangles.")
     if faces.dtype.kind == "u":
-        faces = np.minimum(faces, np.iinfo(np.int64).max)  # an index this large is reported below, not wrapped around
-    with np.errstate(over="ignore", invalid="ignore"):  # long double may not fit; that is reported as infinite
+        faces = np.minimum(faces, np.iinfo(np.int64).max)  # so that check_indices reports it instead of wrapping around
+    with np.errstate(over="ignore", invalid="ignore"):  # a long double can overflow; check_positions reports it
         return vertices.astype(np.float64), faces.astype(np.int64)
-
-
-def _first_of_twins(vertices: np.ndarray, faces: np.ndarray, distance: float | None) -> np.ndarray | None:
-    """For every vertex the first one that lies within a distance of it; None where no two do.
-
-    Rounding opens edges that two faces shared, so where no distance is given only the ends of edges of a single face
-    are merged. The two sides of a thin wall stay apart.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3), whose vertices count.
-        distance: by default a ten-thousandth of the shortest edge at either of the two.
-    """
-    if not len(faces):
-        return None
-    used = used_vertices(faces, len(vertices)) if distance is not None else _open_vertices(faces, len(vertices))
-    if not len(used):
-        return None
-    lengths = face_edge_lengths(vertices, faces)
-    reach = np.full(len(vertices), np.inf)
-    for corner in range(3):  # both edges of a corner
-        for edge in (corner, (corner - 1) % 3):
-            np.minimum.at(reach, faces[:, corner], lengths[:, edge])
-    reach = reach[used] * _TWIN if distance is None else np.full(len(used), distance)
-    largest = float(reach.max())
-    if not 0 < largest < np.inf:
-        return None
-    tree, points = KDTree(vertices[used]), vertices[used]
-    # Each vertex looks as far as its own reach: one coarse part must not make a fine one look at all of itself.
-    crowded = np.flatnonzero(tree.query_ball_point(points, reach, return_length=True) > 1)
-    near = tree.query_ball_point(points[crowded], reach[crowded])
-    counts = np.array([len(others) for others in near], np.int64)
-    others = np.array([other for each in near for other in each], np.int64)
-    pairs = np.stack([np.repeat(crowded, counts), others], axis=1)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    pairs = pairs[apart <= reach[pairs].min(axis=1)]
-    if not len(pairs):
-        return None
-    graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
-    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    lowest = np.full(group.max() + 1, len(vertices))
-    np.minimum.at(lowest, group, used)
-    first = np.arange(len(vertices))
-    first[used] = lowest[group]
-    return first
-
-
-def _open_vertices(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """The vertices at edges that belong to one face only, ascending."""
-    directed = half_edges(faces)
-    _, edge, count = np.unique(undirected_keys(directed, num_vertices), return_inverse=True, return_counts=True)
-    return np.unique(directed[count[edge] == 1])
 
 
 def _counted(count: int, noun: str, nouns: str) -> str:
     return f"{count} {noun if count == 1 else nouns}"
 
 
-class _Workpiece:
-    """The mesh under inspection: arrays that the checks replace, and the list of repairs."""
+class _Checker:
+    """The mesh being checked: arrays that the repairs replace, and the list of repairs.
+
+    Attributes:
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        corners: (F, 3) input corners of the faces, as in `Checked.original_corner`.
+        repair: whether to repair instead of raising.
+        repairs: one phrase for each repair.
+        origin: (V,) input vertex that each vertex is a copy of.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, repair: bool):
         self.vertices = vertices
@@ -210,7 +154,7 @@ class _Workpiece:
         self.origin = np.arange(len(vertices))
 
     def _drop(self, is_bad: np.ndarray, message: Callable[[int], str], what: str) -> None:
-        """Drops the bad faces where repair is wanted, and raises the message for the first one where it is not."""
+        """Drop the bad faces, or raise the message for the first of them if repair is off."""
         count = int(is_bad.sum())
         if not count:
             return
@@ -222,7 +166,7 @@ class _Workpiece:
             raise MeshError(f"Repair left no faces: {'; '.join(self.repairs)}. The source holds no usable surface.")
 
     def check_indices(self) -> None:
-        """Every face refers to vertices that exist."""
+        """Check that every face refers to vertices that exist."""
         num_vertices = len(self.vertices)
 
         def message(face: int) -> str:
@@ -237,11 +181,11 @@ class _Workpiece:
         self._drop(is_bad, message, "that referred to missing vertices")
 
     def check_positions(self) -> None:
-        """The positions in use are finite, and of a size whose powers are finite too."""
+        """Check that the positions in use are finite, and small enough for their powers to be finite."""
         is_finite = np.all(np.isfinite(self.vertices), axis=1)
 
         def not_finite(face: int) -> str:
-            # The first vertex is named, not the first face, since that is what must be corrected.
+            # The message names the first vertex rather than the first face, because the vertex is the cause.
             vertex = int(np.unique(self.faces[~is_finite[self.faces]])[0])
             position = ", ".join(f"{x:g}" for x in self.vertices[vertex])
             return (
@@ -262,36 +206,24 @@ class _Workpiece:
             )
 
         self._drop(~np.all(is_moderate[self.faces], axis=1), too_large, "with a position too large to compute with")
-        # Minus zero and zero are one position.
+        # Adding zero turns -0.0 into 0.0, so that welding by sorting sees a single position.
         self.vertices = self.vertices + 0.0
 
     def merge_vertices(self, weld: bool | float) -> np.ndarray:
-        """Lets faces refer to the first of the vertices at each position; returns it, or -1 where unused, (V,)."""
-        used = used_vertices(self.faces, len(self.vertices))
-        representative = np.full(len(self.vertices), -1, dtype=np.int64)
-        representative[used] = used
-        if isinstance(weld, bool | np.bool_):
-            distance = None
-        elif isinstance(weld, int | str) or weld is None:
-            raise MeshError(f"Expected weld as True, False or a distance such as 1e-6, found {weld!r}.")
-        else:
-            distance = not_negative("weld", weld)
-        if weld is False or weld is np.False_:
-            return representative
-        positions = self.vertices[used]
-        order = np.lexsort(positions.T)  # stable, so the first of equals comes first
-        is_new = np.ones(len(order), bool)
-        is_new[1:] = np.any(positions[order[1:]] != positions[order[:-1]], axis=1)
-        representative[used[order]] = used[order[is_new]][np.cumsum(is_new) - 1]
+        """Merge vertices as `weld` asks; returns the vertex that stands for each, or -1 if unused, (V,)."""
+        representative = welded_vertices(self.vertices, self.faces, weld)
         self.faces = representative[self.faces]
-        first = _first_of_twins(self.vertices, self.faces, distance)
-        if first is not None:
-            representative[used] = first[representative[used]]
-            self.faces = first[self.faces]
         return representative
 
+    def check_faces(self) -> None:
+        """Check that every face has an area, and that the faces form a manifold."""
+        self.check_degenerate()
+        self.check_duplicates()
+        self.check_edges()
+        self.check_fans()
+
     def check_degenerate(self) -> None:
-        """Every face has three different vertices and an area."""
+        """Check that every face has three different vertices and an area."""
         first, second, third = self.faces.T
         repeats = (first == second) | (second == third) | (third == first)
 
@@ -310,7 +242,7 @@ class _Workpiece:
                 "underflow. Scale the mesh, or use repair=True to drop such faces."
             )
 
-        # A face with three corners at one place is thin rather than small.
+        # A face whose corners coincide is reported below as a face without area.
         is_small = (longest < SMALLEST_LENGTH) & (longest > 0)
         self._drop(is_small, too_small, "too small to compute with")
         longest = face_edge_lengths(self.vertices, self.faces).max(axis=1)
@@ -325,9 +257,9 @@ class _Workpiece:
         self._drop(~(areas > THINNEST_FACE * longest**2), no_area, "without area")
 
     def check_duplicates(self) -> None:
-        """No two faces have the same three vertices."""
+        """Check that no two faces have the same three vertices."""
         corners = np.sort(self.faces, axis=1)
-        # Stable, so of equal faces the first comes first. One key for two corners sorts faster than two.
+        # The sort is stable, so the first of equal faces stays. A single key for two corners sorts faster than two.
         order = np.lexsort((corners[:, 2], corners[:, 0] * len(self.vertices) + corners[:, 1]))
         repeats = np.zeros(len(order), bool)
         repeats[order[1:]] = np.all(corners[order[1:]] == corners[order[:-1]], axis=1)
@@ -336,19 +268,19 @@ class _Workpiece:
             twin = int(np.flatnonzero(np.all(corners == corners[face], axis=1))[0])
             return (
                 f"Faces {twin} and {face} have the same corners {tuple(corners[face].tolist())}. "
-                "A surface has one face there. Remove the other, or use repair=True to drop duplicates."
+                "Remove either of them, or use repair=True to drop duplicates."
             )
 
         self._drop(repeats, message, "that duplicated another")
 
     def check_edges(self) -> None:
-        """No edge belongs to more than two faces."""
+        """Check that no edge belongs to more than two faces."""
         keys = undirected_keys(half_edges(self.faces), len(self.vertices))
         in_order = np.sort(keys)
         if not np.any(in_order[2:] == in_order[:-2]):
             return
         face = np.tile(np.arange(len(self.faces)), 3)
-        # Sorted by edge, and within an edge from the largest face to the smallest: the rank within the edge.
+        # Rank the faces at each edge by area, the largest first.
         order = np.lexsort((face, -face_areas(self.vertices, self.faces)[face], keys))
         begins = np.ones(len(order), bool)
         begins[1:] = keys[order[1:]] != keys[order[:-1]]
@@ -368,41 +300,31 @@ class _Workpiece:
         self._drop(is_bad, message, "at edges that had more than two (the two largest stay)")
 
     def check_fans(self) -> None:
-        """The faces at each vertex form one fan; splitting gives every further fan a vertex of its own."""
-        split = self._fans(np.zeros(0, bool))
+        """Check that the faces at each vertex form a single fan; the repair gives every other fan its own vertex."""
+        split = self._split_fans(np.zeros(0, bool))
         if split:
             self.repairs.append(f"split {_counted(split, 'vertex', 'vertices')} where separate fans touched")
 
     def cut_where_one_sided(self) -> None:
-        """Repair cuts components that are not orientable open, along curves where their faces disagree."""
+        """Cut components that are not orientable open if repair is on, along the curves where their faces conflict."""
         if not self.repair:
             return
-        is_cut = disagreeing(self.faces, len(self.vertices))
+        is_cut = conflicting_edges(self.faces, len(self.vertices))
         if is_cut.any():
-            self._fans(is_cut)
+            self._split_fans(is_cut)
             edges = _counted(int(is_cut.sum()), "edge", "edges")
             self.repairs.append(
-                f"cut along {edges} where the surface was one-sided (if you save it, load it with weld=False, or the "
-                "cut closes again)"
+                f"cut along {edges} where the surface was one-sided (if you save the mesh, load it with weld=False; "
+                "welding would close the cut)"
             )
 
-    def _fans(self, is_cut: np.ndarray) -> int:
-        """Give every further fan at a vertex a vertex of its own, where repair is wanted; returns how many were split.
+    def _split_fans(self, is_cut: np.ndarray) -> int:
+        """Give all fans at a vertex but the first a vertex of their own; returns the number of vertices split.
 
         Args:
-            is_cut: the edges, in the order of `shared_edges`, across which fans do not go on; empty for none.
+            is_cut: (P,) whether fans end at each edge of `shared_edges`; empty if they end at none.
         """
-        num_faces = len(self.faces)
-        one, other, same_way = shared_edges(self.faces, len(self.vertices))
-        if is_cut.size:
-            one, other, same_way = one[~is_cut], other[~is_cut], same_way[~is_cut]
-        # Corner j of face f is 3 f + j. A half-edge of block j runs from corner j to corner j + 1 of its face.
-        begin, end = 3 * (one % num_faces) + one // num_faces, 3 * (one % num_faces) + (one // num_faces + 1) % 3
-        first = 3 * (other % num_faces) + other // num_faces
-        last = 3 * (other % num_faces) + (other // num_faces + 1) % 3
-        across = np.concatenate([np.where(same_way, first, last), np.where(same_way, last, first)])
-        fans = components(np.concatenate([begin, end]), across, 3 * num_faces)
-        corners = self.faces.ravel()
+        corners, fans = self.faces.ravel(), self._fan_labels(is_cut)
         order = np.lexsort((fans, corners))
         begins = np.ones(len(order), bool)
         begins[1:] = (corners[order[1:]] != corners[order[:-1]]) | (fans[order[1:]] != fans[order[:-1]])
@@ -418,17 +340,34 @@ class _Workpiece:
                 f"The faces at vertex {split[0]} form {count} fans that touch only there, so the surface is not a "
                 "manifold at it. Give each fan a vertex of its own, or use repair=True to split it."
             )
-        names = fan_vertices.copy()
-        names[is_further] = len(self.vertices) + np.arange(is_further.sum())
-        renamed = np.empty_like(corners)
-        renamed[order] = names[np.cumsum(begins) - 1]
-        self.faces = renamed.reshape(-1, 3)
+        new_vertices = fan_vertices.copy()
+        new_vertices[is_further] = len(self.vertices) + np.arange(is_further.sum())
+        new_corners = np.empty_like(corners)
+        new_corners[order] = new_vertices[np.cumsum(begins) - 1]
+        self.faces = new_corners.reshape(-1, 3)
         self.vertices = np.concatenate([self.vertices, self.vertices[fan_vertices[is_further]]])
         self.origin = np.concatenate([self.origin, self.origin[fan_vertices[is_further]]])
         return len(split)
 
+    def _fan_labels(self, is_cut: np.ndarray) -> np.ndarray:
+        """The label (3F,) of the fan of every corner; corner j of face f has the number 3 f + j."""
+        num_faces = len(self.faces)
+        first, second, same_direction = shared_edges(self.faces, len(self.vertices))
+        if is_cut.size:
+            first, second, same_direction = first[~is_cut], second[~is_cut], same_direction[~is_cut]
+
+        def ends(half_edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            # A half-edge of block j runs from corner j to corner j + 1 of its face.
+            block, face = np.divmod(half_edge, num_faces)
+            return 3 * face + block, 3 * face + (block + 1) % 3
+
+        (begin, end), (other_begin, other_end) = ends(first), ends(second)
+        beside_begin = np.where(same_direction, other_begin, other_end)
+        beside_end = np.where(same_direction, other_end, other_begin)
+        return components(np.concatenate([begin, end]), np.concatenate([beside_begin, beside_end]), count=3 * num_faces)
+
     def check_components(self) -> None:
-        """Every connected component has enough vertices."""
+        """Check that every connected component has enough vertices."""
         edges = half_edges(self.faces)
         labels = components(edges[:, 0], edges[:, 1], len(self.vertices))
         used = used_vertices(self.faces, len(self.vertices))
@@ -438,16 +377,16 @@ class _Workpiece:
         def message(face: int) -> str:
             return (
                 f"The connected component of vertex {self.faces[face].min()} has {face_sizes[face]} vertices; at least "
-                f"{FEWEST_VERTICES} are needed, since second derivatives at a vertex take five neighbours. "
+                f"{FEWEST_VERTICES} are needed, because second derivatives at a vertex need five neighbours. "
                 "Subdivide it, or use repair=True to drop such components."
             )
 
         self._drop(face_sizes < FEWEST_VERTICES, message, "of components too small to differentiate on")
 
     def orient(self) -> int:
-        """Turns faces over until all agree with their neighbours and closed components face out; returns how many."""
-        is_turned = turned_faces(self.vertices, self.faces)
+        """Reverse faces until neighbours agree and closed components face outwards; returns the number of faces."""
+        is_reversed = reversed_faces(self.vertices, self.faces)
         self.faces, self.corners = (
-            np.where(is_turned[:, None], rows[:, [0, 2, 1]], rows) for rows in (self.faces, self.corners)
+            np.where(is_reversed[:, None], rows[:, [0, 2, 1]], rows) for rows in (self.faces, self.corners)
         )
-        return int(is_turned.sum())
+        return int(is_reversed.sum())

@@ -1,22 +1,22 @@
-"""What goes wrong with a mesh: the one error of this room.
-
-What enters: a sentence. What leaves: an exception that callers can catch, as a `ValueError` or by its own name.
-"""
+"""The exception for meshes that cannot be used, and the cleaning of messages."""
 
 
 def in_one_line(message: str) -> str:
-    """A message without line breaks and without the control characters that a file may hold and a terminal obeys."""
+    """The message without line breaks, and with control characters escaped.
+
+    Messages quote files, and a terminal would interpret the control characters in them.
+    """
     words = " ".join(message.split())
-    return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in words)
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in words)
 
 
 class UnreadableError(Exception):
-    """What a reader reports about a file that it could not read; `files` makes it a sentence."""
+    """Raised by a reader that cannot read a file; `files` turns the reason into a `MeshError`."""
 
 
 class MeshError(ValueError):
-    """A mesh that cannot carry differential operators, or a file that holds none.
+    """Raised for a mesh that is not a valid surface, and for a file that does not contain one.
 
-    The message says what was expected, what was found (the first offending index) and what to do. Indices of vertices
-    and faces count from 0, in the order of the file or of the arrays handed in.
+    The message states what was expected, what was found (with the first offending index) and what to do. Indices of
+    vertices and faces count from 0, in the order of the file or of the arrays passed in.
     """

@@ -1,7 +1,6 @@
-"""A mesh file becomes a checked mesh.
+"""`load_mesh`: a checked mesh from a file.
 
-What enters: a path. What leaves: a `Mesh`, or a `MeshError` that begins with the file's name. The formats themselves
-are read in `readers`; here their failures are turned into sentences.
+The formats are parsed in `readers`. This module turns their failures into messages that begin with the file's name.
 """
 
 import contextlib
@@ -18,30 +17,31 @@ from .mesh import Mesh
 from .readers import READERS
 from .text_formats import Polygons
 
-# A packed file is unpacked in pieces of so many bytes, up to so many in all.
-_PIECE, _MOST_UNPACKED = 1 << 20, 4_000_000_000
+# Compressed files are decompressed in pieces of this many bytes, up to a largest total size.
+_PIECE, _MOST_DECOMPRESSED = 1 << 20, 4_000_000_000
 
 
 def load_mesh(path: str | PathLike[str], *, repair: bool = False, weld: bool | float = True) -> Mesh:
-    """The mesh in a file, welded by position and checked; ``mesh.report`` says what was found and done.
+    """The mesh in a file, welded by position and checked; ``mesh.report`` lists its measurements and repairs.
 
-    Reads OBJ, PLY, STL, OFF, GLB and glTF; with the extra ``io`` also VTK, VTU, Gmsh, GIfTI and FreeSurfer's surfaces
-    (``lh.pial``, ``.white``, ``.asc``), with ``viz`` also VTP; each of them packed (``.gz``) too.
-    Faces with more than three corners are split into triangles, convex or not. The parts of a scene are joined, with
-    their transforms applied. ``mesh.original_index`` refers to the vertices in the order of the file.
+    Reads OBJ, PLY, STL, OFF, GLB, glTF and text FreeSurfer surfaces (``.asc``). The extra ``io`` adds VTK, VTU, Gmsh,
+    GIfTI and binary FreeSurfer surfaces (``lh.pial``, ``.white``), and the extra ``viz`` adds VTP. Each format may be
+    compressed (``.gz``). Faces with more than three corners, convex or not, are split into triangles. The parts of a
+    scene are joined, with their transforms applied. ``mesh.original_index`` refers to the vertices in the order of the
+    file.
 
     Args:
-        path: the file; its ending names the format.
-        repair: mend what can be mended, instead of raising; see `Mesh`.
-        weld: merge vertices at the same position, up to rounding; see `Mesh`. Formats without shared vertices (STL), or
-            with seams in their textures, fall apart into pieces without it.
+        path: path of the file; its suffix determines the format.
+        repair: repair the mesh where possible instead of raising; see `Mesh`.
+        weld: merge vertices at the same position up to rounding; see `Mesh`. Without it, the faces of formats without
+            shared vertices (STL) are disconnected, and so are the sides of texture seams.
 
     Raises:
-        MeshError: if there is no such file, its format is unknown, it is damaged, or it holds no surface.
+        MeshError: there is no such file, its format is unknown, it is damaged, or it holds no surface.
     """
     if not isinstance(path, str | PathLike):
-        advice = " Use it as it is." if isinstance(path, Mesh) else " For meshes of other packages use ltl.as_mesh."
-        raise TypeError(f"Expected the path of a file, found a {type(path).__name__}.{advice}")
+        advice = "It needs no loading." if isinstance(path, Mesh) else "For meshes of other packages, use ltl.as_mesh."
+        raise TypeError(f"Expected the path of a file, found a {type(path).__name__}. {advice}")
     path = Path(path)
     try:
         polygons = _read(path)
@@ -54,11 +54,11 @@ def _read(path: Path) -> Polygons:
     """The vertices and triangles of the file."""
     kind = (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower().removeprefix(".")
     try:
-        # Only regular files: a pipe or a device may never end.
+        # Only regular files are read, because a pipe or a device may never end.
         if path.is_dir():
             raise MeshError(f"expected a mesh file, but {path} is a directory. Name a file in it.")
         if not path.is_file():
-            raise MeshError(f"there is no file at {path}. Check the path; relative ones start at {Path.cwd()}.")
+            raise MeshError(f"there is no file at {path}. Check the path; relative paths start at {Path.cwd()}.")
         size = path.stat().st_size
     except (OSError, ValueError) as error:
         if isinstance(error, MeshError):
@@ -70,16 +70,15 @@ def _read(path: Path) -> Polygons:
     if size == 0:
         raise MeshError("the file is empty. Export or download it again.")
     try:
-        # What numbers beyond the range become, the checks of the mesh report.
-        with np.errstate(all="ignore"), _unpacked(path) as unpacked:
-            return READERS[kind](unpacked)
+        # The checks of the mesh report numbers that overflow.
+        with np.errstate(all="ignore"), _decompressed(path) as decompressed:
+            return READERS[kind](decompressed)
     except MeshError:
         raise
-    # Readers meet damaged files with any exception there is. This is the one place where all of them mean the same: the
-    # file cannot be read.
+    # Readers raise arbitrary exceptions on damaged files. All of them mean that the file cannot be read.
     except Exception as error:
-        said = str(error) if isinstance(error, UnreadableError) else f"{type(error).__name__}: {error}"
-        reason = said[:200].rstrip(": ")
+        message = str(error) if isinstance(error, UnreadableError) else f"{type(error).__name__}: {error}"
+        reason = message[:200].rstrip(": ")
         raise MeshError(
             f"the file could not be read as {kind.upper()} ({reason}). "
             "It may be truncated or damaged: export or download it again, or convert it to OBJ or PLY."
@@ -87,16 +86,17 @@ def _read(path: Path) -> Polygons:
 
 
 @contextlib.contextmanager
-def _unpacked(path: Path) -> Iterator[Path]:
-    """The file itself, or for a packed one (``.gz``) a copy without the packing, as long as it is read."""
+def _decompressed(path: Path) -> Iterator[Path]:
+    """The path of the file, or, for a compressed file (``.gz``), of a temporary decompressed copy."""
     if path.suffix.lower() != ".gz":
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / path.with_suffix("").name
-        with gzip.open(path, "rb") as packed, open(copy, "wb") as file:
-            while piece := packed.read(_PIECE):
-                if file.tell() + len(piece) > _MOST_UNPACKED:
-                    raise MeshError(f"it unpacks to more than {_MOST_UNPACKED / 1e9:.0f} GB. Unpack it first.")
+        with gzip.open(path, "rb") as compressed, open(copy, "wb") as file:
+            while piece := compressed.read(_PIECE):
+                if file.tell() + len(piece) > _MOST_DECOMPRESSED:
+                    limit = f"{_MOST_DECOMPRESSED / 1e9:.0f} GB"
+                    raise MeshError(f"it decompresses to more than {limit}. Decompress it first.")
                 file.write(piece)
         yield copy

@@ -1,12 +1,12 @@
-"""Mesh formats that other packages read, each file in a process of its own.
+"""A script that reads a file with another package, in a process of its own.
 
-What enters, on the command line: the name of a reader, a file, and where to write the result. What leaves: an NPZ file
-of arrays, and a text file beside it that says by which names, or why there are none. Of a mesh these are vertices
-(V, 3), the corners of all polygons one after the other, and their sizes; of a file of fields its fields.
+A damaged file can make these packages print, exit, run out of memory or never return, and a malicious file can make
+them read other files. The separate process protects the calling program from this. The script imports nothing from
+ltljax, because that would import JAX.
 
-A damaged file can make these packages print, end the process, take all memory or never return, and a crafted one can
-make them read other files. None of this affects the calling program. This file is run as a script and imports nothing
-of ltljax, which would start JAX.
+Its arguments are the name of a reader, the file, and the path of the result. The result is an NPZ file of arrays, and
+beside it a JSON file with their names or the reason of a failure. A mesh gives vertices (V, 3), the corners of all
+polygons, concatenated, and the number of corners of each polygon; a file of fields gives its fields.
 """
 
 import importlib
@@ -18,44 +18,64 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-if __name__ == "__main__":  # NumPy may lie where the calling program found it, too
+if __name__ == "__main__":  # use the import path of the calling program
     sys.path[:] = json.loads(sys.argv[6])
 
 import numpy as np
 
 
 class Refused(Exception):
-    """Why a readable file is refused, as a sentence."""
+    """Raised for a readable file that is not accepted; the message says why."""
 
 
-class Read(NamedTuple):
-    """Vertices (V, 3), the corners of all polygons, and the number of corners of each."""
+class PolygonSoup(NamedTuple):
+    """Vertices (V, 3), the corners of all polygons, concatenated, and the number of corners of each polygon."""
 
     vertices: np.ndarray
     corners: np.ndarray
     sizes: np.ndarray
 
 
-def read_meshio(path: Path) -> Read:
-    """VTK, VTU and Gmsh: triangles, quadrangles and polygons. Curved elements are reduced to their corners."""
+def polygons_of_cells(points: np.ndarray, cells: Iterable[tuple[str, Any]]) -> PolygonSoup:
+    """The triangles, quadrangles and polygons among cells as meshio describes them.
+
+    Curved elements are reduced to their corners, and plane points (V, 2) get a third coordinate of zero.
+
+    Args:
+        points: (V, 2) or (V, 3).
+        cells: the type of each block of cells, such as ``triangle6``, and its vertex indices.
+    """
+    num_corners = {"triangle": 3, "quad": 4, "polygon": None}
+    polygons: list[list[int]] = []
+    for kind, indices in cells:
+        name = kind.rstrip("0123456789")
+        if name in num_corners:
+            polygons += [list(cell)[: num_corners[name]] for cell in np.asarray(indices).tolist()]
+    if points.ndim == 2 and points.shape[1] == 2:
+        points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    return polygon_soup(points, polygons)
+
+
+def polygon_soup(points: np.ndarray, polygons: list[list[int]]) -> PolygonSoup:
+    """The `PolygonSoup` of polygons that are lists of vertex indices."""
+    corners = np.array([corner for polygon in polygons for corner in polygon], np.int64)
+    return PolygonSoup(points, corners, np.array([len(polygon) for polygon in polygons], np.int64))
+
+
+def read_meshio(path: Path) -> PolygonSoup:
+    """The surface in a VTK, VTU or Gmsh file."""
     import meshio
 
     grid = meshio.read(path)
-    num_corners = {"triangle": 3, "quad": 4, "polygon": None}
-    polygons: list[list[int]] = []
-    for block in grid.cells:
-        name = block.type.rstrip("0123456789")
-        if name in num_corners:
-            polygons += [list(cell)[: num_corners[name]] for cell in np.asarray(block.data).tolist()]
-    if not polygons:
+    surface = polygons_of_cells(np.asarray(grid.points), [(block.type, block.data) for block in grid.cells])
+    if not surface.sizes.size:
         kinds = ", ".join(sorted({block.type for block in grid.cells})) or "nothing"
         raise Refused(f"expected triangles, found {kinds}. Extract the surface first, e.g. with pyvista or Gmsh.")
-    corners = [corner for polygon in polygons for corner in polygon]
-    return Read(_in_space(np.asarray(grid.points)), np.array(corners), np.array([len(cell) for cell in polygons]))
+    return surface
 
 
-def read_vtk(path: Path) -> Read:
-    """VTK surfaces (POLYDATA), text, binary or XML."""
+def read_vtk(path: Path) -> PolygonSoup:
+    """A VTK surface (POLYDATA), text, binary or XML."""
     import pyvista
 
     surface: Any = pyvista.read(path)
@@ -63,45 +83,45 @@ def read_vtk(path: Path) -> Read:
         kind = type(surface).__name__
         raise Refused(f"expected a VTK surface (PolyData), found {kind}. Extract the surface or export it again.")
     triangles = np.reshape(surface.triangulate().faces, (-1, 4))[:, 1:]
-    return _of_triangles(surface.points, triangles)
+    return _triangle_soup(surface.points, triangles)
 
 
-def read_gifti(path: Path) -> Read:
-    """GIfTI surfaces, as brain atlases use them, in the space that their transform leads to."""
+def read_gifti(path: Path) -> PolygonSoup:
+    """A GIfTI surface with its coordinate transform applied; brain atlases use this format."""
     import nibabel
 
     image: Any = nibabel.load(path)
     points = image.get_arrays_from_intent("NIFTI_INTENT_POINTSET")
     triangles = image.get_arrays_from_intent("NIFTI_INTENT_TRIANGLE")
     if not points or not triangles:
-        raise Refused("expected a surface, found no points or no triangles. Choose the file that holds the geometry.")
+        raise Refused("expected a surface, found no points or no triangles. Use the file that contains the geometry.")
     vertices = np.asarray(points[0].data, np.float64)
     if points[0].coordsys is not None:
         transform = np.asarray(points[0].coordsys.xform, np.float64)
         vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
-    return _of_triangles(vertices, triangles[0].data)
+    return _triangle_soup(vertices, triangles[0].data)
 
 
-def read_freesurfer(path: Path) -> Read:
-    """FreeSurfer's binary surfaces, such as ``lh.pial``."""
+def read_freesurfer(path: Path) -> PolygonSoup:
+    """A binary FreeSurfer surface, such as ``lh.pial``."""
     from nibabel.freesurfer.io import read_geometry
 
     points, triangles = read_geometry(path)[:2]
-    return _of_triangles(points, triangles)
+    return _triangle_soup(points, triangles)
 
 
 def read_vtk_fields(path: Path) -> dict[str, Any]:
-    """The arrays that a VTK file holds for its points."""
+    """The point data of a VTK file by name."""
     import pyvista
 
     mesh: Any = pyvista.read(path)
     if not mesh.n_points:
-        raise Refused("expected fields on points, found no points. The file is damaged, or empty.")
+        raise Refused("expected fields on points, found no points. The file is damaged or empty.")
     return {str(name): np.asarray(values) for name, values in mesh.point_data.items()}
 
 
 def read_gifti_fields(path: Path) -> dict[str, Any]:
-    """The arrays of a GIfTI file that are no geometry; those of the same name stacked, as of a series."""
+    """The data arrays of a GIfTI file by name; arrays of the same name are stacked, because they form a series."""
     import nibabel
     from nibabel import nifti1
 
@@ -115,7 +135,7 @@ def read_gifti_fields(path: Path) -> dict[str, Any]:
 
 
 def read_freesurfer_fields(path: Path) -> dict[str, Any]:
-    """The numbers of a FreeSurfer file such as ``lh.curv``, by its ending."""
+    """The values of a FreeSurfer file such as ``lh.curv``, named by its suffix."""
     from nibabel.freesurfer.io import read_morph_data
 
     return {path.suffix.removeprefix("."): np.asarray(read_morph_data(path), np.float64)}
@@ -132,7 +152,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
 }
 
 
-# The package that each of them needs.
+# The package that each reader needs.
 PACKAGES = {
     "meshio": "meshio",
     "vtk": "pyvista",
@@ -144,48 +164,41 @@ PACKAGES = {
 }
 
 
-def _in_space(points: np.ndarray) -> np.ndarray:
-    """Points (V, 3), with zeros added to plane ones (V, 2)."""
-    if points.ndim == 2 and points.shape[1] == 2:
-        return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    return points
-
-
-def _of_triangles(vertices: Any, triangles: Any) -> Read:
+def _triangle_soup(vertices: Any, triangles: Any) -> PolygonSoup:
     corners = np.asarray(triangles, np.int64).reshape(-1, 3)
-    return Read(np.asarray(vertices, np.float64), corners.ravel(), np.full(len(corners), 3))
+    return PolygonSoup(np.asarray(vertices, np.float64), corners.ravel(), np.full(len(corners), 3))
 
 
 def _limit(memory: float, seconds: float) -> None:
-    """Bound what this process may take, where the operating system can."""
+    """Limit the memory and computing time of this process, if the operating system supports it."""
     try:
         import resource
     except ImportError:  # Windows
         return
-    for kind, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
+    for kind, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):
         try:
-            resource.setrlimit(kind, (int(most), int(most)))
-        except (ValueError, OSError):  # a lower bound is in force, or the system knows none
+            resource.setrlimit(kind, (int(limit), int(limit)))
+        except (ValueError, OSError):  # a lower limit is in force, or the system has no such limit
             continue
 
 
-def _open_nothing_but(path: Path, folders: Iterable[str]) -> None:
-    """Forbid this process to open files other than this one and those of Python's own folders."""
-    allowed = [os.path.realpath(folder) + os.sep for folder in folders]
+def _forbid_other_files(path: Path, folders: Iterable[str]) -> None:
+    """Let this process open only the file and the files in the folders of Python."""
+    allowed = tuple(os.path.realpath(folder) + os.sep for folder in folders)
     own = os.path.realpath(path)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event != "open" or not isinstance(arguments[0], str | bytes | os.PathLike):
             return
         name = os.path.realpath(os.fsdecode(arguments[0]))
-        if name != own and not name.startswith(tuple(allowed)):
-            raise Refused("it refers to another file, which is not read. Export it with the numbers inside.")
+        if name != own and not name.startswith(allowed):
+            raise Refused("it refers to another file, which is not read. Export it with all data inside.")
 
     sys.addaudithook(hook)
 
 
 def _reason(error: BaseException, package: str) -> str:
-    if isinstance(error, SystemExit):  # its number says nothing
+    if isinstance(error, SystemExit):  # its exit code is meaningless
         return f"{package} gave up"
     if isinstance(error, MemoryError):
         return "MemoryError: it asks for far more memory than a file of its size should"
@@ -193,26 +206,26 @@ def _reason(error: BaseException, package: str) -> str:
 
 
 def main(reader: str, path: Path, target: Path, memory: float, seconds: float) -> None:
-    """Read a file and save what it holds, or why it cannot be read."""
+    """Read a file and save its arrays, or the reason why it cannot be read."""
     _limit(memory, seconds)
     importlib.import_module(PACKAGES[reader])
     packages = [folder for folder in sys.path if folder.rstrip("/\\").endswith(("site-packages", "dist-packages"))]
     warnings.simplefilter("ignore")
-    said: dict[str, Any] = {}
-    # Opened before other files are forbidden.
-    with open(target, "wb") as file, open(target.with_suffix(".json"), "w", encoding="utf-8") as report:
-        _open_nothing_but(path, [*packages, sys.prefix, sys.base_prefix])
+    report: dict[str, Any] = {}
+    # The results must be opened before other files are forbidden.
+    with open(target, "wb") as file, open(target.with_suffix(".json"), "w", encoding="utf-8") as report_file:
+        _forbid_other_files(path, [*packages, sys.prefix, sys.base_prefix])
         try:
             arrays = READERS[reader](path)
-            said["names"] = list(arrays)
+            report["names"] = list(arrays)
             np.savez(file, **{f"array_{index}": array for index, array in enumerate(arrays.values())})
         except Refused as error:
-            said["refused"] = str(error)
-        # Readers of other projects meet damaged files with any exception there is, some even by leaving the program.
-        # They mean the same: the file cannot be read.
+            report["refused"] = str(error)
+        # These packages raise arbitrary exceptions on damaged files, and some even exit. All of them mean that the file
+        # cannot be read.
         except (Exception, SystemExit) as error:
-            said["failed"] = _reason(error, PACKAGES[reader])
-        json.dump(said, report)
+            report["failed"] = _reason(error, PACKAGES[reader])
+        json.dump(report, report_file)
 
 
 if __name__ == "__main__":

@@ -1,26 +1,24 @@
-"""The regular patterns that shapes are made of: which points, and which of them form triangles.
-
-What enters: counts. What leaves: parameters or unit positions, and faces (F, 3).
-"""
+"""The regular lattices that the built-in shapes are made of: parameters or unit positions, and faces (F, 3)."""
 
 import numpy as np
 
 from .._base.arguments import at_least, positive
 
-# Ten subdivisions are ten million vertices; beyond that a slip of the finger is likelier than a wish.
+# Ten subdivisions give ten million vertices. A larger number is most likely a mistake.
 _MOST_SUBDIVISIONS = 10
 
 
 def grid_faces(num_rows: int, num_columns: int, *, wrap_rows: bool, wrap_columns: bool) -> np.ndarray:
-    """The triangles of a lattice whose vertex (i, j) is ``i * num_columns + j``, all quads cut from (i, j).
+    """The triangles of a lattice whose vertex (i, j) has the index ``i * num_columns + j``.
 
-    Each turns from the direction of the rows' index to that of the columns'.
+    Each cell is cut along the diagonal from (i, j) to (i + 1, j + 1). Triangles are oriented from the direction of
+    increasing i to the direction of increasing j.
 
     Args:
         num_rows: number of rows.
         num_columns: number of columns.
-        wrap_rows: whether the last row meets the first.
-        wrap_columns: whether the last column meets the first.
+        wrap_rows: whether the last row is joined to the first.
+        wrap_columns: whether the last column is joined to the first.
     """
     i = np.arange(num_rows if wrap_rows else num_rows - 1)[:, None]
     j = np.arange(num_columns if wrap_columns else num_columns - 1)[None, :]
@@ -31,32 +29,38 @@ def grid_faces(num_rows: int, num_columns: int, *, wrap_rows: bool, wrap_columns
 
 
 def alternating_faces(num_rows: int, num_columns: int) -> np.ndarray:
-    """The triangles of a lattice whose vertex (i, j) is ``i * num_columns + j``, neighbouring quads cut crosswise.
-
-    Each turns from the direction of the rows' index to that of the columns'.
-    """
+    """The triangles of a lattice as in `grid_faces`, but with diagonals that alternate between neighbouring cells."""
     faces = grid_faces(num_rows, num_columns, wrap_rows=False, wrap_columns=False).reshape(-1, 6)
     corner, down, across, _, _, side = faces.T
-    other = np.stack([corner, down, side, down, across, side], axis=1)
+    other_diagonal = np.stack([corner, down, side, down, across, side], axis=1)
     is_odd = np.indices((num_rows - 1, num_columns - 1)).sum(axis=0).reshape(-1, 1) % 2 == 1
-    return np.where(is_odd, other, faces).reshape(-1, 3)
+    return np.where(is_odd, other_diagonal, faces).reshape(-1, 3)
 
 
 def torus_points(x: np.ndarray, y: np.ndarray, major: float | int, minor: float | int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and unit normals, (V, 3) each, of a torus at angles x around the tube and y around the axis, (V,)."""
+    """Positions and unit normals (V, 3) of a torus.
+
+    Args:
+        x: (V,) angles around the tube.
+        y: (V,) angles around the axis.
+        major: distance of the tube's centre from the axis.
+        minor: radius of the tube.
+    """
     major, minor = positive("major", major), positive("minor", minor)
     if minor >= major:
-        raise ValueError(f"minor must be smaller than major, found {minor} and {major}: the torus would cut itself.")
+        raise ValueError(
+            f"minor must be smaller than major, found {minor} and {major}: the torus would intersect itself."
+        )
     normals = np.stack([np.cos(x) * np.cos(y), np.cos(x) * np.sin(y), np.sin(x)], axis=1)
     centres = major * np.stack([np.cos(y), np.sin(y), np.zeros_like(y)], axis=1)
     return centres + minor * normals, normals
 
 
 def disk_lattice(rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Concentric rings of 6, 12, 18, ... vertices about a centre: distances (V,) up to 1, angles (V,), faces (F, 3)."""
+    """Distances (V,) up to 1, angles (V,) and faces (F, 3) of a disk: a centre and rings of 6, 12, 18, ... vertices."""
     rings = at_least("rings", rings, 1)
     ring = np.repeat(np.arange(rings + 1), np.maximum(6 * np.arange(rings + 1), 1))
-    first = np.concatenate([[0], 1 + 3 * np.arange(rings + 1) * np.arange(1, rings + 2)])  # ring j begins at first[j]
+    first = np.concatenate([[0], 1 + 3 * np.arange(rings + 1) * np.arange(1, rings + 2)])  # first vertex of each ring
     place = np.arange(len(ring)) - first[ring]
     angle = 2 * np.pi * place / np.maximum(6 * ring, 1)
     faces = []
@@ -76,13 +80,13 @@ def disk_lattice(rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def icosahedral_lattice(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (V, 3) and faces (F, 3) of the subdivided icosahedron, facing out."""
+    """Unit vectors (V, 3) and outward-facing faces (F, 3) of the subdivided icosahedron."""
     subdivisions = at_least("subdivisions", subdivisions, 0, _MOST_SUBDIVISIONS)
-    # North pole, upper and lower ring of five (the lower turned by 36 degrees), south pole.
-    turn = 2 * np.pi * np.arange(5) / 5
+    # The north pole, an upper and a lower ring of five vertices (the lower rotated by 36 degrees), and the south pole.
+    angle = 2 * np.pi * np.arange(5) / 5
     z, rho = 1 / np.sqrt(5), 2 / np.sqrt(5)
-    upper = np.stack([rho * np.cos(turn), rho * np.sin(turn), np.full(5, z)], axis=1)
-    lower = np.stack([rho * np.cos(turn + np.pi / 5), rho * np.sin(turn + np.pi / 5), np.full(5, -z)], axis=1)
+    upper = np.stack([rho * np.cos(angle), rho * np.sin(angle), np.full(5, z)], axis=1)
+    lower = np.stack([rho * np.cos(angle + np.pi / 5), rho * np.sin(angle + np.pi / 5), np.full(5, -z)], axis=1)
     directions = np.concatenate([[[0, 0, 1]], upper, lower, [[0, 0, -1]]])
     i, after = np.arange(5), (np.arange(5) + 1) % 5
     faces = np.concatenate(
@@ -94,20 +98,20 @@ def icosahedral_lattice(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         ]
     )
     for _ in range(subdivisions):
-        directions, faces = _halved(directions, faces)
+        directions, faces = _subdivided(directions, faces)
     return directions, faces
 
 
-def _halved(directions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every face cut into four at the middles of its edges, which move out onto the unit sphere."""
+def _subdivided(directions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every face split into four at the midpoints of its edges, which are projected onto the unit sphere."""
     ahead = np.roll(faces, -1, axis=1)
     low, high = np.minimum(faces, ahead), np.maximum(faces, ahead)
     keys, inverse = np.unique(low * len(directions) + high, return_inverse=True)
     ends = directions[keys // len(directions)], directions[keys % len(directions)]
-    middles = ends[0] + ends[1]
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    middle = len(directions) + inverse.reshape(-1, 3)
-    (a, b, c), (ab, bc, ca) = faces.T, middle.T
+    midpoints = ends[0] + ends[1]
+    midpoints /= np.linalg.norm(midpoints, axis=1, keepdims=True)
+    midpoint = len(directions) + inverse.reshape(-1, 3)
+    (a, b, c), (ab, bc, ca) = faces.T, midpoint.T
     corners = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
     finer = np.stack([np.stack(face, axis=1) for face in corners], axis=1).reshape(-1, 3)
-    return np.concatenate([directions, middles]), finer
+    return np.concatenate([directions, midpoints]), finer

@@ -1,7 +1,6 @@
-"""`Mesh`: a triangle mesh that has passed every check.
+"""`Mesh`: an immutable, checked triangle mesh.
 
-What enters: vertices and faces, by hand, from a shape or from a file. What leaves: an immutable record whose faces are
-a manifold, consistently oriented surface, so that no later room needs to ask.
+Its faces form a manifold, consistently oriented surface, so that code that takes a `Mesh` need not check this again.
 """
 
 import dataclasses
@@ -18,20 +17,21 @@ from .report import MeshReport, corner_angles, face_areas, face_edge_lengths
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
 class Mesh:
-    """A checked triangle mesh: manifold, consistently oriented (outwards where closed), with finite geometry.
+    """A checked triangle mesh: manifold, consistently oriented (outwards if closed), with finite geometry.
 
-    Faces that disagree with their neighbours are turned over, and vertices that no face refers to are dropped; the
-    report says so. All arrays are read-only.
+    Faces that are oriented against their neighbours are reversed, and vertices without a face are dropped; the report
+    counts both. All arrays are read-only.
 
     Attributes:
-        vertices: (V, 3) float64, positions.
-        faces: (F, 3) int32, vertex indices, counter-clockwise seen from outside.
-        original_index: (V,) int64, for each vertex the (first) vertex it came from in the file or array handed in.
-        welded_index: (V_original,) int64, for each vertex handed in the one it became, or -1 if it was dropped.
-        normals: (V, 3) float64, exact unit outward normals where the shape is known by formula, else None.
-        uv: (F, 3, 2) float64, places in an image of the corners of every face, where the file has them, else None.
-        source_order: (V,) int32, the vertices in the order they were handed in: ``data[mesh.source_order]`` undoes
-            `reordered`; without it 0, 1, 2, ...
+        vertices: (V, 3) float64 positions.
+        faces: (F, 3) int32 vertex indices, counter-clockwise seen from outside.
+        original_index: (V,) int64, the first vertex of the source (the file or arrays) that was merged into each
+            vertex.
+        welded_index: (V_original,) int64, the vertex that each vertex of the source became, or -1 if it was dropped.
+        normals: (V, 3) float64 exact unit outward normals if the shape is known by formula, else None.
+        uv: (F, 3, 2) float64 texture coordinates of the corners of every face, or None if there are none.
+        source_order: (V,) int32, the vertices in the order of the source: ``data[mesh.source_order]`` undoes
+            `reordered`. It is 0, 1, 2, ... in a mesh that was not reordered.
     """
 
     vertices: np.ndarray
@@ -53,22 +53,22 @@ class Mesh:
         normals: Any | None = None,
         uv: Any | None = None,
     ):
-        """Checks the arrays.
+        """Check the arrays.
 
         Args:
             vertices: (V, 3) positions.
             faces: (F, 3) vertex indices, counted from 0.
-            repair: mend what can be mended, instead of raising: drop degenerate, duplicate and broken faces, the extra
-                faces at an edge of three, and components that are too small; split vertices where fans touch. The
-                report lists each action.
-            weld: True merges vertices that coincide up to rounding: those at the same position, and, where an edge has
-                one face only, its ends with others closer than a ten-thousandth of the shortest edge at either. A
-                distance merges all vertices within it.
+            repair: repair the mesh where possible instead of raising: drop degenerate, duplicate and invalid faces,
+                extra faces at an edge with more than two, and components that are too small; split vertices where
+                separate fans touch; cut surfaces that are not orientable. The report lists each repair.
+            weld: True merges vertices that coincide up to rounding: vertices at the same position, and ends of edges
+                with a single face that are closer than a ten-thousandth of the shortest edge at either. A distance
+                merges all vertices within it.
             normals: (V, 3) exact unit outward normals, if the surface is known by formula.
-            uv: (F, 3, 2) places in an image of the corners of every face, v upwards.
+            uv: (F, 3, 2) texture coordinates of the corners of every face, v upwards.
 
         Raises:
-            MeshError: if the arrays are not a surface; the message names the first offending index.
+            MeshError: the arrays are not a surface; the message names the first offending index.
         """
         checked = check(vertices, faces, repair=repair, weld=weld)
         unit_normals = None
@@ -81,19 +81,24 @@ class Mesh:
             is_bad = ~(np.abs(np.linalg.norm(unit_normals, axis=1) - 1) < 1e-6)
             if is_bad.any():
                 first = int(checked.original_index[np.flatnonzero(is_bad)[0]])
-                raise MeshError(f"Normals must have length 1, but the one at vertex {first} has not. Normalise them.")
-        places = None
+                length = float(np.linalg.norm(unit_normals[is_bad][0]))
+                raise MeshError(
+                    f"Normals must have length 1, found length {length:g} at vertex {first}. Normalise them."
+                )
+        texture_coordinates = None
         if uv is not None:
-            places = np.asarray(uv, dtype=np.float64)
-            if places.shape != (checked.faces_in_file, 3, 2):
-                raise MeshError(f"Expected uv of shape {(checked.faces_in_file, 3, 2)}, found {places.shape}.")
-            places = places.reshape(-1, 2)[checked.original_corner]
-        self._fill(checked, unit_normals, places, np.arange(len(checked.vertices), dtype=np.int32))
+            texture_coordinates = np.asarray(uv, dtype=np.float64)
+            if texture_coordinates.shape != (checked.faces_in_file, 3, 2):
+                raise MeshError(
+                    f"Expected uv of shape {(checked.faces_in_file, 3, 2)}, found {texture_coordinates.shape}."
+                )
+            texture_coordinates = texture_coordinates.reshape(-1, 2)[checked.original_corner]
+        self._fill(checked, unit_normals, texture_coordinates, np.arange(len(checked.vertices), dtype=np.int32))
 
     def _fill(
         self, checked: Checked, normals: np.ndarray | None, uv: np.ndarray | None, source_order: np.ndarray
     ) -> None:
-        """Sets the fields, once, and makes their arrays read-only."""
+        """Set the fields and make their arrays read-only."""
         fields = {
             "vertices": checked.vertices,
             "faces": checked.faces,
@@ -128,7 +133,7 @@ class Mesh:
     def boundary_loops(self) -> list[np.ndarray]:
         """The boundary curves, each an int32 array of vertices with the surface on the left.
 
-        A loop begins at its first vertex in the order of the source, and the loops are sorted by that vertex.
+        A loop begins at the vertex that comes first in the source, and the loops are sorted by that vertex.
         """
         rank = np.argsort(self.source_order)
         loops = topology.boundary_loops(self.faces, self.num_vertices)
@@ -171,7 +176,7 @@ class Mesh:
 
     @cached_property
     def report(self) -> MeshReport:
-        """What the mesh is like and what was done to it; prints as a table."""
+        """The measurements and repairs of the mesh; prints as a table."""
         checked, lengths = self._checked, self.edge_lengths
         angles = np.degrees(corner_angles(self.vertices, self.faces))
         valences = np.bincount(self.edges.ravel(), minlength=self.num_vertices)
@@ -206,17 +211,17 @@ class Mesh:
         )
 
     def pull(self, original_data: Any) -> np.ndarray:
-        """Data of this mesh's vertices (V, ...) from data of the vertices handed in (V_original, ...)."""
+        """Data on the vertices of this mesh (V, ...) from data on the vertices of the source (V_original, ...)."""
         data = np.asarray(original_data)
         self._expect_rows(data, len(self.welded_index), "vertices in the source")
         return data[self.original_index]
 
     def push(self, data: Any, fill: Any = np.nan) -> np.ndarray:
-        """Data of the vertices handed in (V_original, ...) from data of this mesh (V, ...).
+        """Data on the vertices of the source (V_original, ...) from data on the vertices of this mesh (V, ...).
 
         Args:
-            data: (V, ...) one entry per vertex of this mesh.
-            fill: the value at vertices that were dropped.
+            data: (V, ...) an entry for each vertex of this mesh.
+            fill: value at vertices that were dropped.
         """
         data = np.asarray(data)
         self._expect_rows(data, self.num_vertices, "vertices")
@@ -227,17 +232,20 @@ class Mesh:
     @staticmethod
     def _expect_rows(data: np.ndarray, count: int, what: str) -> None:
         if data.ndim == 0 or len(data) != count:
-            raise ValueError(f"The data must have one entry for each of {count} {what}, found the shape {data.shape}.")
+            raise ValueError(f"The data must have one entry for each of {count} {what}, found shape {data.shape}.")
 
     def scaled(self, factor: float | int) -> "Mesh":
-        """The mesh with all positions multiplied by a positive factor; faces, indices and normals stay.
+        """The mesh with all positions multiplied by a positive factor; faces, indices and normals do not change.
 
         Raises:
-            MeshError: if the factor is not positive, or the result would be too large or too small to compute with.
+            MeshError: the factor is not positive, or the result would be too large or too small to compute with.
         """
         factor = float(factor)
         if not 0 < factor < np.inf:
-            raise MeshError(f"The factor must be positive and finite, found {factor}. A mirror image faces inwards.")
+            raise MeshError(
+                f"The factor must be positive and finite, found {factor}. A negative factor would turn the mesh inside "
+                "out."
+            )
         with np.errstate(over="ignore"):
             vertices = self.vertices * factor
             smallest = float(face_edge_lengths(self.vertices, self.faces).max(axis=1).min()) * factor
@@ -245,32 +253,33 @@ class Mesh:
         if not (largest <= LARGEST_LENGTH and smallest >= SMALLEST_LENGTH):
             raise MeshError(
                 f"Scaling by {factor:g} makes faces of size {smallest:g} and positions of size {largest:g}; areas and "
-                f"weights need {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}. Use a factor closer to 1."
+                f"weights need sizes from {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}. Use a factor closer to 1."
             )
         mesh = object.__new__(Mesh)
         mesh._fill(dataclasses.replace(self._checked, vertices=vertices), self.normals, self.uv, self.source_order)
         return mesh
 
     def reordered(self) -> "Mesh":
-        """The mesh with its vertices renumbered so that neighbours are near one another in memory.
+        """The mesh with its vertices renumbered so that neighbours are close to one another in memory.
 
-        On it operators on a scan in no order run up to five times faster. Faces keep their order and
-        boundary loops their numbers, components may not; `pull` and `push` go on to lead from and to the data of the
-        source, and ``data[mesh.source_order]`` puts data of the new order back into that of the source.
+        Operators on a scan with an arbitrary vertex order run up to five times faster on the reordered mesh. The order
+        of faces and the numbers of boundary loops do not change; the numbers of components may. `pull` and `push` still
+        map from and to data in the order of the source. If ``mesh`` is the result, ``data[mesh.source_order]`` puts
+        data on it back into the original order.
         """
         order = topology.locality_order(self.faces, self.num_vertices)
-        place = np.empty(self.num_vertices, np.int32)
-        place[order] = np.arange(self.num_vertices, dtype=np.int32)
+        new_index = np.empty(self.num_vertices, np.int32)
+        new_index[order] = np.arange(self.num_vertices, dtype=np.int32)
         checked = dataclasses.replace(
             self._checked,
             vertices=self.vertices[order],
-            faces=place[self.faces],
+            faces=new_index[self.faces],
             original_index=self.original_index[order],
-            welded_index=np.where(self.welded_index < 0, -1, place[self.welded_index]).astype(np.int64),
+            welded_index=np.where(self.welded_index < 0, -1, new_index[self.welded_index]).astype(np.int64),
         )
         mesh = object.__new__(Mesh)
         normals = None if self.normals is None else self.normals[order]
-        mesh._fill(checked, normals, self.uv, place[self.source_order])
+        mesh._fill(checked, normals, self.uv, new_index[self.source_order])
         return mesh
 
     def __repr__(self) -> str:

@@ -1,9 +1,7 @@
-"""The PLY format, text and binary.
+"""Parser of PLY files, text and binary.
 
-What enters: the bytes of a file. What leaves: `Polygons`, unchecked.
-
-trimesh reads PLY too, but takes the number of corners of the first face for that of all: a binary file of triangles and
-quadrangles is refused, or misread where the lengths happen to agree.
+trimesh reads PLY too, but it assumes that all faces have as many corners as the first. It rejects or misreads a binary
+file of triangles and quadrangles.
 """
 
 from typing import NamedTuple
@@ -12,7 +10,7 @@ import numpy as np
 
 from .errors import MeshError
 from .polygons import triangulated
-from .text_formats import Polygons, coordinates, next_rows, nothing_more, polygon_rows
+from .text_formats import Polygons, coordinates, expect_end, next_rows, polygon_rows
 
 _CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -23,19 +21,23 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class _Property(NamedTuple):
+    """A column of an element; `size_code` is the type of the length of a list, or None for a scalar."""
+
     name: str
     code: str
-    size_code: str | None  # of a list, the type of its length
+    size_code: str | None
 
 
 class _Element(NamedTuple):
+    """A table of the file, such as its vertices or its faces."""
+
     name: str
     rows: int
     properties: list[_Property]
 
 
 def parse_ply(data: bytes) -> Polygons:
-    """PLY, text or binary."""
+    """The geometry of a PLY file."""
     kind, elements, body = _parts(data)
     if kind == "ascii":
         return _parse_text(body.decode("utf-8", errors="replace"), elements)
@@ -43,10 +45,10 @@ def parse_ply(data: bytes) -> Polygons:
 
 
 def vertex_properties(data: bytes) -> dict[str, np.ndarray]:
-    """What a PLY file has at its vertices, by name and of the types it states, coordinates included."""
+    """The vertex properties of a PLY file by name, including the coordinates, with the types of the file."""
     kind, elements, body = _parts(data)
     if not elements or elements[0].name != "vertex" or any(item.size_code for item in elements[0].properties):
-        raise MeshError("expected vertices first, without lists.")
+        raise MeshError("expected the vertices to come first and to have no lists. Export the file again.")
     element = elements[0]
     if kind == "ascii":
         lines = [words for line in body.decode("utf-8", errors="replace").splitlines() if (words := line.split())]
@@ -60,21 +62,21 @@ def vertex_properties(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _parts(data: bytes) -> tuple[str, list[_Element], bytes]:
-    """The format of a file, its elements, and what follows its head."""
-    head, end, body = data.partition(b"end_header")
-    if not head.startswith(b"ply") or not end:
-        raise MeshError("expected a head from 'ply' to 'end_header'. The file is damaged or not PLY.")
-    kind, elements = _parse_head(head.decode("utf-8", errors="replace"))
+    """The format of a file, its elements, and the bytes after its header."""
+    header, end, body = data.partition(b"end_header")
+    if not header.startswith(b"ply") or not end:
+        raise MeshError("expected a header from 'ply' to 'end_header'. The file is damaged or not PLY.")
+    kind, elements = _parse_header(header.decode("utf-8", errors="replace"))
     if kind != "ascii" and kind not in _BYTE_ORDERS:
         raise MeshError(f"the format {kind!r} is not known. Export as ascii or binary_little_endian.")
-    # One line end belongs to the head; the next byte is data, even if it looks like another.
+    # The header ends with a single line break. The next byte is data, even if it looks like another line break.
     return kind, elements, body[2:] if body[:2] == b"\r\n" else body[1:]
 
 
-def _parse_head(head: str) -> tuple[str, list[_Element]]:
+def _parse_header(header: str) -> tuple[str, list[_Element]]:
     kind, elements = "", []
-    for words in map(str.split, head.splitlines()):
-        if words[:1] == ["property"]:  # some programs shout
+    for words in map(str.split, header.splitlines()):
+        if words[:1] == ["property"]:  # some programs write the types in upper case
             words = [*(word.lower() for word in words[:-1]), words[-1]]
         match words:
             case ["format", name, *_]:
@@ -85,7 +87,7 @@ def _parse_head(head: str) -> tuple[str, list[_Element]]:
                 elements[-1].properties.append(_Property(name, _code(type_), _code(size_type)))
             case ["property", type_, name]:
                 elements[-1].properties.append(_Property(name, _code(type_), None))
-            case _:  # comments
+            case _:  # a comment
                 pass
     return kind, elements
 
@@ -97,7 +99,7 @@ def _code(kind: str) -> str:
 
 
 def _corner_list(element: _Element) -> int | None:
-    """Which property holds the corners of a face: the list of that name, else the first list."""
+    """The index of the property that lists the corners of a face: the list of that name, else the first list."""
     lists = [index for index, item in enumerate(element.properties) if item.size_code]
     named = [index for index in lists if element.properties[index].name in ("vertex_indices", "vertex_index")]
     return (named or lists or [None])[0]
@@ -105,26 +107,27 @@ def _corner_list(element: _Element) -> int | None:
 
 def _parse_text(body: str, elements: list[_Element]) -> Polygons:
     rows = [words for line in body.splitlines() if (words := line.split())]
-    vertices, position = np.zeros((0, 3)), 0
-    rows_of_faces, lead_of_faces, strips = [], 0, []
+    vertices, start = np.zeros((0, 3)), 0
+    face_rows, num_words_before, strips = [], 0, []
     for element in elements:
-        here = next_rows(rows, position, element.rows, element.name)
-        position += element.rows
+        element_rows = next_rows(rows, start, element.rows, element.name)
+        start += element.rows
         names = [item.name for item in element.properties]
-        which = _corner_list(element)
-        lead = element.properties[:which]
-        if any(item.size_code for item in lead) and element.name in ("vertex", "face"):
-            raise MeshError(f"the list {lead[0].name!r} stands before the numbers of interest. Export without it.")
+        index = _corner_list(element)
+        before = element.properties[:index]
+        if any(item.size_code for item in before) and element.name in ("vertex", "face"):
+            name = before[0].name
+            raise MeshError(f"the list {name!r} comes before the coordinates or corners. Export the file without it.")
         if element.name == "vertex":
-            vertices = coordinates(here, [names.index(axis) for axis in "xyz"])
-        elif element.name == "face" and which is not None:
-            rows_of_faces, lead_of_faces = here, which
-        elif element.name == "tristrips" and which is not None:
-            # Their entries follow the number of entries, like the corners of faces.
-            numbers = [int(word) for row in here for word in (*row[which + 1 : which + 1 + int(row[which])], "-1")]
-            strips.append(_strip_triangles(np.array(numbers, np.int64)))
-    nothing_more(rows, position)
-    triangles = polygon_rows(vertices, rows_of_faces, lead_of_faces)
+            vertices = coordinates(element_rows, [names.index(axis) for axis in "xyz"])
+        elif element.name == "face" and index is not None:
+            face_rows, num_words_before = element_rows, index
+        elif element.name == "tristrips" and index is not None:
+            # The number of entries comes before the entries of a strip, as it does for faces.
+            entries = [row[index + 1 : index + 1 + int(row[index])] for row in element_rows]
+            strips.append(_strip_triangles(np.array([int(word) for strip in entries for word in (*strip, "-1")], int)))
+    expect_end(rows, start)
+    triangles = polygon_rows(vertices, face_rows, num_words_before)
     return Polygons(vertices, np.concatenate([triangles, *strips]))
 
 
@@ -132,8 +135,8 @@ def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons
     vertices, offset = np.zeros((0, 3)), 0
     lists, strips = (np.zeros(0, np.int64), np.zeros(0, np.int64)), []
     for element in elements:
-        which = _corner_list(element)
-        if which is None:
+        index = _corner_list(element)
+        if index is None:
             dtype = np.dtype([(item.name, order + item.code) for item in element.properties])
             _expect(body, offset, element.rows * dtype.itemsize, element)
             rows = np.frombuffer(body, dtype, element.rows, offset)
@@ -141,16 +144,16 @@ def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons
             if element.name == "vertex":
                 vertices = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
         else:
-            corners, sizes, offset = _list_rows(body, element, order, offset, which)
+            corners, sizes, offset = _list_rows(body, element, order, offset, index)
             if element.name == "face":
                 lists = corners, sizes
             elif element.name == "tristrips":
-                # Each list is a strip of its own.
+                # A negative number separates the lists, because each is a strip.
                 strips.append(_strip_triangles(np.insert(corners, np.cumsum(sizes), -1)))
     if elements and offset < len(body.rstrip(b"\r\n\0 ")):
         raise MeshError(
-            f"the file holds {len(body) - offset} bytes beyond the rows that its head announces. Correct the numbers "
-            "in the head, or export the file again."
+            f"the file holds {len(body) - offset} bytes beyond the rows that its header announces. Correct the numbers "
+            "in the header, or export the file again."
         )
     corners, sizes = lists
     triangles = corners[triangulated(vertices, corners, sizes)]
@@ -158,54 +161,56 @@ def _parse_binary(body: bytes, elements: list[_Element], order: str) -> Polygons
 
 
 def _strip_triangles(strips: np.ndarray) -> np.ndarray:
-    """The triangles (F, 3) of strips, of which every other one is turned over; a negative number ends a strip."""
+    """The triangles (F, 3) of triangle strips; a negative number ends a strip.
+
+    Every second triangle of a strip is reversed, so that all have the same orientation.
+    """
     triples = np.stack([strips[:-2], strips[1:-1], strips[2:]], axis=1)
     ends = np.flatnonzero(strips < 0)
     begins = np.concatenate([[0], ends + 1])
-    place = np.arange(len(triples))
-    is_turned = (place - begins[np.searchsorted(ends, place)]) % 2 == 1
-    triples[is_turned] = triples[is_turned][:, [1, 0, 2]]
-    is_there = (triples >= 0).all(axis=1)
-    # A corner given twice leads to the next strip.
-    is_there &= (triples[:, 0] != triples[:, 1]) & (triples[:, 1] != triples[:, 2]) & (triples[:, 0] != triples[:, 2])
-    return triples[is_there]
+    position = np.arange(len(triples))
+    is_reversed = (position - begins[np.searchsorted(ends, position)]) % 2 == 1
+    triples[is_reversed] = triples[is_reversed][:, [1, 0, 2]]
+    a, b, c = triples.T
+    # Programs repeat corners to join strips; the triangles there have no area.
+    return triples[(triples >= 0).all(axis=1) & (a != b) & (b != c) & (a != c)]
 
 
 def _list_rows(
-    body: bytes, element: _Element, order: str, offset: int, which: int
+    body: bytes, element: _Element, order: str, offset: int, index: int
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The entries of one list of all rows, their numbers, and where the next element begins."""
+    """The entries of the list property ``index`` of all rows, their numbers, and the offset of the next element."""
     if element.rows <= 0:
         _expect(body, offset, element.rows, element)
         return np.zeros(0, np.int64), np.zeros(0, np.int64), offset
-    # Mostly all rows are alike: then they are one array.
+    # In most files, all rows have the same layout as the first. They are then read as a single array.
     spans, stop = _row(body, element, order, offset)
     fields = []
-    for index, (item, (_, size)) in enumerate(zip(element.properties, spans, strict=True)):
+    for i, (item, (_, size)) in enumerate(zip(element.properties, spans, strict=True)):
         if item.size_code:
-            fields.append((f"size {index}", order + item.size_code))
-        fields.append((f"data {index}", order + item.code, (size,)))
+            fields.append((f"size {i}", order + item.size_code))
+        fields.append((f"data {i}", order + item.code, (size,)))
     dtype = np.dtype(fields)
     if offset + element.rows * dtype.itemsize <= len(body):
         rows = np.frombuffer(body, dtype, element.rows, offset)
-        lists = [index for index, item in enumerate(element.properties) if item.size_code]
-        if all(np.all(rows[f"size {index}"] == spans[index][1]) for index in lists):
-            corners = rows[f"data {which}"].astype(np.int64).ravel()
-            sizes = np.full(element.rows, spans[which][1])
+        lists = [i for i, item in enumerate(element.properties) if item.size_code]
+        if all(np.all(rows[f"size {i}"] == spans[i][1]) for i in lists):
+            corners = rows[f"data {index}"].astype(np.int64).ravel()
+            sizes = np.full(element.rows, spans[index][1])
             return corners, sizes, offset + element.rows * dtype.itemsize
-    pieces, numbers = [], []
-    code = order + element.properties[which].code
+    pieces, sizes = [], []
+    code = order + element.properties[index].code
     for _ in range(element.rows):
         spans, stop = _row(body, element, order, offset)
-        start, size = spans[which]
+        start, size = spans[index]
         pieces.append(np.frombuffer(body, code, size, start))
-        numbers.append(size)
+        sizes.append(size)
         offset = stop
-    return np.concatenate(pieces).astype(np.int64), np.array(numbers), offset
+    return np.concatenate(pieces).astype(np.int64), np.array(sizes), offset
 
 
 def _row(body: bytes, element: _Element, order: str, offset: int) -> tuple[list[tuple[int, int]], int]:
-    """Where each property of one row begins and how many entries it has, and where the next row begins."""
+    """The offset and the number of entries of each property of a row, and the offset of the next row."""
     spans = []
     for item in element.properties:
         size = 1
@@ -221,7 +226,7 @@ def _row(body: bytes, element: _Element, order: str, offset: int) -> tuple[list[
 
 
 def _expect(body: bytes, offset: int, length: int, element: _Element) -> None:
-    """Raises where the file does not hold what its head announces."""
+    """Raise if the file ends before the ``length`` bytes that its header announces."""
     if length < 0 or offset + length > len(body):
         raise MeshError(
             f"the file announces {element.rows} rows of {element.name}, but its {len(body)} bytes of data end before "

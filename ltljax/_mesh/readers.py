@@ -1,9 +1,6 @@
-"""How each file format spells vertices and faces.
+"""The readers of the file formats: each takes the path of an existing file and returns unchecked `Polygons`.
 
-What enters: the path of an existing file. What leaves: `Polygons`, unchecked. Readers may raise anything; `files` turns
-it into a `MeshError`. A reader raises one itself where it knows better what is wrong.
-
-Other packages are imported where they are used: who computes on a built-in shape need not wait for them.
+A reader raises a `MeshError` if it knows what is wrong. `files` turns all other exceptions into one.
 """
 
 import importlib.util
@@ -29,36 +26,36 @@ from .ply import parse_ply
 from .polygons import triangulated
 from .text_formats import Polygons, next_rows, parse_obj, parse_off, parse_stl, separate_triangles
 
-# What a reader of another package may take: bytes of memory and seconds of computing, and more for each byte of the
-# file. Waiting for the disk, it may take a few times as long.
+# Limits on the memory (bytes) and computing time (seconds) of a reader of another package.
 _MEMORY, _MEMORY_PER_BYTE = 3e9, 100
 _SECONDS, _SECONDS_PER_BYTE = 15, 1e-6
+# Largest ratio of the elapsed time, which includes waiting for the disk, to the computing time.
 _PATIENCE = 4
 
-# trimesh reports on damaged files to this logger, which without a handler would print.
+# trimesh logs problems of damaged files. Without a handler, they would be printed.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 def read_obj(path: Path) -> Polygons:
-    """Wavefront OBJ."""
+    """The geometry of a Wavefront OBJ file."""
     return parse_obj(path.read_bytes())
 
 
 def read_off(path: Path) -> Polygons:
-    """OFF."""
+    """The geometry of an OFF file."""
     return parse_off(path.read_bytes())
 
 
 def read_ply(path: Path) -> Polygons:
-    """PLY, text or binary."""
+    """The geometry of a PLY file, text or binary."""
     return parse_ply(path.read_bytes())
 
 
 def read_stl(path: Path) -> Polygons:
-    """STL, text or binary; every triangle brings its own three vertices."""
+    """The geometry of an STL file, text or binary; every triangle has its own three vertices."""
     data = path.read_bytes()
     announced = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
-    # Binary files may begin with "solid" like those in text, so the length decides.
+    # Binary files too may begin with "solid", so the length decides.
     if len(data) == 84 + 50 * announced:
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         return separate_triangles(np.frombuffer(data, record, offset=84)["corners"])
@@ -71,7 +68,7 @@ def read_stl(path: Path) -> Polygons:
 
 
 def read_glb(path: Path) -> Polygons:
-    """Binary glTF."""
+    """The geometry of a binary glTF file."""
     from trimesh.exchange.gltf import load_glb
 
     data = path.read_bytes()
@@ -81,13 +78,13 @@ def read_glb(path: Path) -> Polygons:
 
 
 def read_gltf(path: Path) -> Polygons:
-    """Text glTF, with its buffers inside or beside it."""
+    """The geometry of a text glTF file, with its buffers inside or beside it."""
     from trimesh.exchange.gltf import load_gltf
 
     header = json.loads(path.read_bytes().decode("utf-8"))
     _check_gltf(header, path)
     for buffer in header.get("buffers", []):
-        # A file beside it is named as in a web address, with %20 for a space.
+        # The names of files are URL-encoded.
         if not buffer["uri"].startswith("data:"):
             buffer["uri"] = unquote(buffer["uri"])
     checked = io.BytesIO(json.dumps(header).encode())
@@ -95,7 +92,7 @@ def read_gltf(path: Path) -> Polygons:
 
 
 def read_freesurfer_text(path: Path) -> Polygons:
-    """FreeSurfer's surfaces in text (``.asc``)."""
+    """The geometry of a text FreeSurfer surface (``.asc``)."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     words = [row for line in lines if (row := line.partition("#")[0].split())]
     num_vertices, num_faces = int(words[0][0]), int(words[0][1])
@@ -105,12 +102,16 @@ def read_freesurfer_text(path: Path) -> Polygons:
 
 
 def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
-    """The arrays that a reader of another package finds in a file, by name; see `foreign`.
+    """The arrays by name that a reader of another package returns for a file.
 
-    It runs in a process of its own, with bounds on its memory and time.
+    The reader runs in a process of its own, with limits on its memory and time; see `foreign`.
+
+    Args:
+        reader: a key of `foreign.READERS`.
+        path: the file.
 
     Raises:
-        MeshError: the package is not installed, the file is not taken, or reading it takes too long.
+        MeshError: the package is not installed, it does not accept the file, or reading takes too long.
         UnreadableError: the file is damaged, or reading it takes too much memory.
     """
     package = foreign.PACKAGES[reader]
@@ -119,33 +120,34 @@ def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
         raise MeshError(f'reading this kind of file needs {package}. Run: pip install "ltljax[{extra}]"')
     size = path.stat().st_size
     memory, seconds = _MEMORY + _MEMORY_PER_BYTE * size, _SECONDS + _SECONDS_PER_BYTE * size
-    # One thread: the libraries below NumPy reserve memory for each.
+    # A single thread, because the libraries below NumPy reserve memory for each thread.
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "arrays.npz"
         arguments = [reader, path.absolute(), target, memory, seconds, json.dumps([*map(str, sys.path)])]
         command = [sys.executable, "-I", foreign.__file__, *map(str, arguments)]
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 command, capture_output=True, timeout=_PATIENCE * seconds, check=False, env=environment
             )
         except subprocess.TimeoutExpired:
-            raise MeshError(f"{package} did not end within {_PATIENCE * seconds:.0f} s. Convert it to PLY.") from None
-        report = target.with_suffix(".json")
-        text = report.read_text(encoding="utf-8") if report.exists() else ""
+            limit = f"{_PATIENCE * seconds:.0f} s"
+            raise MeshError(f"{package} did not end within {limit}. Convert the file to PLY.") from None
+        report_file = target.with_suffix(".json")
+        text = report_file.read_text(encoding="utf-8") if report_file.exists() else ""
         if not text:
-            raise UnreadableError(_last_words(done, package, seconds))
-        said = json.loads(text)
-        if "refused" in said:
-            raise MeshError(said["refused"])
-        if "failed" in said:
-            raise UnreadableError(said["failed"])
+            raise UnreadableError(_crash_reason(process, package, seconds))
+        report = json.loads(text)
+        if "refused" in report:
+            raise MeshError(report["refused"])
+        if "failed" in report:
+            raise UnreadableError(report["failed"])
         with np.load(target) as arrays:
-            return {name: arrays[f"array_{index}"] for index, name in enumerate(said["names"])}
+            return {name: arrays[f"array_{index}"] for index, name in enumerate(report["names"])}
 
 
-def _by(reader: str) -> Callable[[Path], Polygons]:
-    """What reads a mesh by another package."""
+def _foreign_reader(reader: str) -> Callable[[Path], Polygons]:
+    """The function that reads a mesh with a reader of another package."""
 
     def read(path: Path) -> Polygons:
         arrays = read_elsewhere(reader, path)
@@ -155,19 +157,19 @@ def _by(reader: str) -> Callable[[Path], Polygons]:
     return read
 
 
-def _last_words(done: subprocess.CompletedProcess[bytes], package: str, seconds: float) -> str:
-    """Why a process left no report."""
-    if hasattr(signal, "SIGXCPU") and done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-        return f"{package} was stopped after {seconds:.0f} s of computing, or for want of memory"
-    lines = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
-    return f"{package} ended with code {done.returncode}" + (f": {lines[-1]}" if lines else "")
+def _crash_reason(process: subprocess.CompletedProcess[bytes], package: str, seconds: float) -> str:
+    """Why a process ended without a report."""
+    if hasattr(signal, "SIGXCPU") and process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return f"{package} was stopped after {seconds:.0f} s of computing, or because it ran out of memory"
+    lines = process.stderr.decode("utf-8", errors="replace").strip().splitlines()
+    return f"{package} ended with code {process.returncode}" + (f": {lines[-1]}" if lines else "")
 
 
 def read_legacy_vtk(path: Path) -> Polygons:
-    """VTK's older format. Most surfaces in it are POLYDATA, which meshio does not read."""
+    """The geometry of a legacy VTK file. meshio does not read POLYDATA, which most of these files contain."""
     with open(path, "rb") as file:
         is_surface = b"POLYDATA" in file.read(1000)
-    return _by("vtk" if is_surface else "meshio")(path)
+    return _foreign_reader("vtk" if is_surface else "meshio")(path)
 
 
 READERS: dict[str, Callable[[Path], Polygons]] = {
@@ -178,12 +180,12 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     "glb": read_glb,
     "gltf": read_gltf,
     "vtk": read_legacy_vtk,
-    "vtu": _by("meshio"),
-    "msh": _by("meshio"),
-    "vtp": _by("vtk"),
-    "gii": _by("gifti"),
+    "vtu": _foreign_reader("meshio"),
+    "msh": _foreign_reader("meshio"),
+    "vtp": _foreign_reader("vtk"),
+    "gii": _foreign_reader("gifti"),
     "asc": read_freesurfer_text,
-    **dict.fromkeys(("pial", "white", "inflated", "orig", "smoothwm", "sphere"), _by("freesurfer")),
+    **dict.fromkeys(("pial", "white", "inflated", "orig", "smoothwm", "sphere"), _foreign_reader("freesurfer")),
 }
 
 
@@ -194,7 +196,7 @@ def _resolver(path: Path) -> Any:
 
 
 def _polygons(loaded: dict[str, Any]) -> Polygons:
-    """The geometry in what a trimesh reader returns: one mesh, or several by name."""
+    """The geometry in the result of a trimesh reader, which is a mesh or several meshes by name."""
     if "geometry" in loaded:
         return _joined([_polygons(part) for part in loaded["geometry"].values()])
     faces = loaded.get("faces")
@@ -204,20 +206,20 @@ def _polygons(loaded: dict[str, Any]) -> Polygons:
 
 
 def _joined(parts: list[Polygons]) -> Polygons:
-    """All parts in one numbering."""
+    """All parts as a single mesh."""
     if not parts:
         return Polygons(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     counts = np.array([len(part.vertices) for part in parts])
     faces = []
-    for part, count, shift in zip(parts, counts, np.cumsum(counts) - counts, strict=True):
+    for part, count, first in zip(parts, counts, np.cumsum(counts) - counts, strict=True):
         indices = part.faces.astype(np.int64)
-        # An index beyond its own part must not reach into the next one.
-        faces.append(np.where((indices >= 0) & (indices < count), indices + shift, counts.sum()))
+        # An index out of range must stay so, and not refer to a vertex of another part.
+        faces.append(np.where((indices >= 0) & (indices < count), indices + first, counts.sum()))
     return Polygons(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 def _check_gltf(header: dict[str, Any], path: Path) -> None:
-    """Refuses what would be read wrongly, or at a size that the file does not back."""
+    """Raise for features that trimesh reads wrongly, and for buffers that are missing or outside the file's folder."""
     for index, accessor in enumerate(header.get("accessors", [])):
         if "bufferView" not in accessor or "sparse" in accessor:
             raise MeshError(f"accessor {index} is compressed or sparse. Export the file without compression.")
@@ -225,30 +227,30 @@ def _check_gltf(header: dict[str, Any], path: Path) -> None:
         uri = buffer.get("uri", "data:")
         if uri.startswith("data:"):
             continue
-        place = (path.parent / unquote(uri)).resolve()
-        if not place.is_relative_to(path.parent.resolve()):
+        buffer_file = (path.parent / unquote(uri)).resolve()
+        if not buffer_file.is_relative_to(path.parent.resolve()):
             raise MeshError(f"the buffer {uri[:80]!r} lies outside the file's own folder. Export to GLB.")
-        if not place.is_file():
+        if not buffer_file.is_file():
             raise MeshError(f"the buffer {uri[:80]!r} is missing. Put it beside the file, or export to GLB.")
 
 
 def _scene(loaded: dict[str, Any]) -> Polygons:
-    """The parts of a scene, each instance with its transform, in the order of the scene's nodes."""
+    """The geometry of a scene: each instance with its transform, in the order of the scene's nodes."""
     geometry = loaded["geometry"]
     nodes = {node["frame_to"]: node for node in loaded["graph"]}
-    placed = [node for node in loaded["graph"] if "faces" in geometry.get(node.get("geometry"), {})]
+    instances = [node for node in loaded["graph"] if "faces" in geometry.get(node.get("geometry"), {})]
     parts = []
-    for node in placed:
+    for node in instances:
         matrix, parent, depth = np.asarray(node["matrix"]), node["frame_from"], 0
         while parent in nodes:
             matrix, parent, depth = np.asarray(nodes[parent]["matrix"]) @ matrix, nodes[parent]["frame_from"], depth + 1
             if depth > len(nodes):
-                raise MeshError("the scene's nodes contain each other in a circle. Export the file again.")
+                raise MeshError("the scene's nodes contain each other in a cycle. Export the file again.")
         part = _polygons(geometry[node["geometry"]])
         vertices = np.asarray(part.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        # A mirrored instance turns its faces inside out.
+        # A reflection would turn the faces inside out.
         faces = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
         parts.append(Polygons(vertices, faces))
-    if not parts:  # a file without a scene: its meshes as they are
+    if not parts:  # a file without a scene: its meshes without transforms
         return _joined([_polygons(part) for part in geometry.values() if "faces" in part])
     return _joined(parts)

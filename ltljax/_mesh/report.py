@@ -1,20 +1,17 @@
-"""What a mesh is like: the report that `mesh.report` holds and `ltljax info` prints.
-
-What enters: a checked mesh and the record of what was done to it. What leaves: numbers, a table, a dictionary.
-"""
+"""The measurements of a mesh: the report of `mesh.report` and `ltljax info`, and the functions that measure."""
 
 import dataclasses
 from typing import Any
 
 import numpy as np
 
-# How many times its own size a shape may lie from the origin without being far from it.
+# A shape is far from the origin if its distance exceeds this multiple of its size.
 _FAR = 2
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshReport:
-    """The measurements of a mesh and what was done to it on the way in.
+    """The measurements of a mesh, and the changes made to it while it was loaded and checked.
 
     Attributes:
         vertices: number of vertices.
@@ -22,10 +19,10 @@ class MeshReport:
         edges: number of edges.
         components: number of connected components.
         boundary_loops: length in edges of each boundary loop.
-        boundary_edges: number of edges with one face.
+        boundary_edges: number of edges with a single face.
         euler_number: vertices - edges + faces.
-        genus: number of handles, of all components together.
-        is_closed: whether there is no boundary.
+        genus: number of handles of all components together.
+        is_closed: whether the surface has no boundary.
         area: total area.
         mesh_size: mean edge length.
         min_edge: shortest edge length.
@@ -35,12 +32,12 @@ class MeshReport:
         min_valence: smallest number of edges at a vertex.
         max_valence: largest number of edges at a vertex.
         mean_valence: mean number of edges at a vertex.
-        vertices_in_file: number of vertices in the file or the array handed in.
-        faces_in_file: number of triangles in the file (after splitting larger faces) or the array handed in.
-        welded_vertices: vertices merged into another one at the same position, up to rounding.
-        dropped_vertices: vertices that no face refers to.
-        reoriented_faces: faces turned over so that all agree, and point outwards on closed components.
-        repairs: one sentence for each thing that was mended.
+        vertices_in_file: number of vertices in the source, a file or an array.
+        faces_in_file: number of triangles in the source, after splitting larger faces.
+        welded_vertices: number of vertices merged into another at the same position up to rounding.
+        dropped_vertices: number of vertices without a face.
+        reoriented_faces: number of faces reversed so that neighbours agree and closed components face outwards.
+        repairs: one phrase for each repair.
     """
 
     vertices: int
@@ -108,18 +105,18 @@ def corner_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = vertices[faces]
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, -2, axis=1) - corners
-    # atan2 keeps its accuracy at angles close to 0 and to pi, where arccos loses half the digits.
+    # Near 0 and pi, atan2 is accurate, whereas arccos loses half the digits.
     return np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), np.sum(ahead * behind, axis=2))
 
 
 def far_middle(vertices: np.ndarray) -> np.ndarray:
-    """The middle of a shape's bounding box, where that is farther from the origin than twice its size; else zero.
+    """The middle of the bounding box if it is farther from the origin than twice the size of the box, else zero.
 
-    So far away float32 would blur the shape, unless positions are taken from the middle.
+    So far away, float32 loses the details of a shape unless positions are relative to the middle.
     """
     low, high = (np.asarray(end, np.float64) for end in (vertices.min(axis=0), vertices.max(axis=0)))
     middle = (low + high) / 2
-    # By `hypot`, which neither overflows nor underflows. Positions that are no numbers are not far.
+    # `hypot` neither overflows nor underflows. Positions that are NaN give zero.
     return middle if np.hypot.reduce(middle) > _FAR * np.hypot.reduce(high - low) else np.zeros(3)
 
 
@@ -130,7 +127,7 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals of the vertices, (V, 3): those of the faces around each, weighted by area; zero without any."""
+    """Unit normals of the vertices, (V, 3): area-weighted means of face normals; zero for vertices without faces."""
     first, second, third = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, np.cross(second - first, third - first)[:, None])

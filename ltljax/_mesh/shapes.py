@@ -1,7 +1,7 @@
-"""Built-in shapes: surfaces whose geometry is known by formula.
+"""Built-in shapes, whose geometry is known by formula.
 
-What enters: sizes and counts. What leaves: a checked `Mesh`, oriented outwards (upwards where plane), with the exact
-unit normals of the smooth surface. Irregular meshes are made in `irregular` and are available here too.
+Meshes are oriented outwards (plane ones upwards), and smooth shapes have the exact unit normals of the surface.
+Irregular meshes are defined in `irregular` and are also available here.
 """
 
 import numpy as np
@@ -28,30 +28,30 @@ __all__ = [
 
 
 def icosphere(subdivisions: int = 4, radius: float | int = 1.0) -> Mesh:
-    """A sphere about the origin: the icosahedron, its edges halved ``subdivisions`` times, pushed onto the sphere.
+    """A sphere about the origin: an icosahedron whose faces are subdivided and projected onto the sphere.
 
-    It has 10 * 4^n + 2 vertices: 162, 642, 2562, 10242 for n = 2 to 5.
+    It has 10 * 4^n + 2 vertices: 162, 642, 2562, 10242 for n = 2 to 5 subdivisions.
 
     Args:
-        subdivisions: 0 to 10.
-        radius: of the sphere.
+        subdivisions: number of subdivisions, 0 to 10.
+        radius: radius of the sphere.
     """
     directions, faces = icosahedral_lattice(subdivisions)
     return Mesh(positive("radius", radius) * directions, faces, normals=directions)
 
 
 def ellipsoid(axes: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), subdivisions: int = 4) -> Mesh:
-    """An ellipsoid about the origin, x^2/a^2 + y^2/b^2 + z^2/c^2 = 1: the icosphere, stretched.
+    """An ellipsoid about the origin, x^2/a^2 + y^2/b^2 + z^2/c^2 = 1: a stretched icosphere.
 
     Args:
-        axes: the half axes a, b, c.
-        subdivisions: of the icosphere, 0 to 10.
+        axes: semi-axes a, b, c.
+        subdivisions: number of subdivisions of the icosphere, 0 to 10.
     """
     if np.shape(axes) != (3,):
-        raise ValueError(f"axes must be three half axes such as (1.0, 1.0, 0.5), found the shape {np.shape(axes)}.")
+        raise ValueError(f"axes must be three semi-axes such as (1.0, 1.0, 0.5), found shape {np.shape(axes)}.")
     half_axes = np.array([positive("each of the axes", axis) for axis in axes])
     directions, faces = icosahedral_lattice(subdivisions)
-    gradients = directions / half_axes  # of the left side above, up to a factor
+    gradients = directions / half_axes  # half the gradient of x^2/a^2 + y^2/b^2 + z^2/c^2
     normals = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
     return Mesh(half_axes * directions, faces, normals=normals)
 
@@ -59,14 +59,14 @@ def ellipsoid(axes: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.
 def torus(major: float | int = 2.0, minor: float | int = 1.0, n_major: int = 96, n_minor: int = 48) -> Mesh:
     """A torus about the z axis: ((a + r cos x) cos y, (a + r cos x) sin y, r sin x).
 
-    Vertex ``i * n_minor + j`` is at y = 2 pi i / n_major, x = 2 pi j / n_minor. All quads are cut along the same
+    Vertex ``i * n_minor + j`` is at y = 2 pi i / n_major, x = 2 pi j / n_minor. All cells are cut along the same
     diagonal, so every vertex has six neighbours.
 
     Args:
-        major: a, the distance of the tube's centre from the axis; larger than r.
-        minor: r, the radius of the tube.
-        n_major: vertices around the axis, at least 3.
-        n_minor: vertices around the tube, at least 3.
+        major: distance a of the tube's centre from the axis; larger than r.
+        minor: radius r of the tube.
+        n_major: number of vertices around the axis, at least 3.
+        n_minor: number of vertices around the tube, at least 3.
     """
     n_major, n_minor = at_least("n_major", n_major, 3), at_least("n_minor", n_minor, 3)
     y = np.repeat(2 * np.pi * np.arange(n_major) / n_major, n_minor)
@@ -76,12 +76,12 @@ def torus(major: float | int = 2.0, minor: float | int = 1.0, n_major: int = 96,
 
 
 def disk(radius: float | int = 1.0, rings: int = 16) -> Mesh:
-    """A plane disk about the origin in z = 0, facing up: ring j has 6 j evenly spaced vertices.
+    """A plane disk about the origin in z = 0, facing upwards; ring j has 6 j evenly spaced vertices.
 
-    It has 1 + 3 rings (rings + 1) vertices; those of the last ring lie on the circle.
+    It has 1 + 3 rings (rings + 1) vertices; the last ring lies on the circle.
 
     Args:
-        radius: of the disk.
+        radius: radius of the disk.
         rings: number of concentric rings, at least 1.
     """
     distance, angle, faces = disk_lattice(rings)
@@ -95,8 +95,8 @@ def hemisphere(radius: float | int = 1.0, rings: int = 16) -> Mesh:
     """The upper half of a sphere about the origin; the boundary is the equator, exactly in z = 0.
 
     Args:
-        radius: of the sphere.
-        rings: number of rings between the pole and the equator, at least 1; ring j has 6 j vertices.
+        radius: radius of the sphere.
+        rings: number of rings from the pole to the equator, at least 1; ring j has 6 j vertices.
     """
     distance, angle, faces = disk_lattice(rings)
     polar = distance * np.pi / 2
@@ -106,33 +106,33 @@ def hemisphere(radius: float | int = 1.0, rings: int = 16) -> Mesh:
 
 
 def square(side: float | int = 1.0, n: int = 32) -> Mesh:
-    """The plane square [0, side]^2 in z = 0, facing up, of n by n cells cut along the same diagonal.
+    """The plane square [0, side]^2 in z = 0, facing upwards, of n by n cells cut along the same diagonal.
 
     Vertex ``i * (n + 1) + j`` is at (side j / n, side i / n, 0).
 
     Args:
         side: length of a side.
-        n: cells along a side, at least 2.
+        n: number of cells along a side, at least 2.
     """
     n = at_least("n", n, 2)
     side = positive("side", side)
     y, x = np.repeat(np.arange(n + 1) / n, n + 1), np.tile(np.arange(n + 1) / n, n + 1)
     vertices = side * np.stack([x, y, np.zeros_like(x)], axis=1)
-    # Rows run along y, so the lattice of the torus, whose rows come first, would face down.
+    # The rows run along y, so the faces have to be reversed to face upwards.
     faces = grid_faces(n + 1, n + 1, wrap_rows=False, wrap_columns=False)[:, [0, 2, 1]]
     return Mesh(vertices, faces, normals=np.tile([0.0, 0.0, 1.0], (len(vertices), 1)))
 
 
 def cylinder(radius: float | int = 1.0, height: float | int = 2.0, n_around: int = 64, n_along: int = 20) -> Mesh:
-    """The side of a cylinder about the z axis, -height / 2 <= z <= height / 2, open at both ends.
+    """The lateral surface of a cylinder about the z axis, -height / 2 <= z <= height / 2, open at both ends.
 
     Vertex ``i * (n_along + 1) + j`` is at the angle 2 pi i / n_around and the height -height / 2 + j height / n_along.
 
     Args:
-        radius: of the cylinder.
-        height: of the cylinder.
-        n_around: vertices around the axis, at least 3.
-        n_along: cells along the axis, at least 1.
+        radius: radius of the cylinder.
+        height: height of the cylinder.
+        n_around: number of vertices around the axis, at least 3.
+        n_along: number of cells along the axis, at least 1.
     """
     n_around, n_along = at_least("n_around", n_around, 3), at_least("n_along", n_along, 1)
     angle = np.repeat(2 * np.pi * np.arange(n_around) / n_around, n_along + 1)
@@ -147,11 +147,12 @@ def box(sides: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), n
     """The surface of the box [0, a] x [0, b] x [0, c], of nearly square cells whose diagonals alternate.
 
     Args:
-        sides: the lengths a, b, c of the sides.
-        n: cells along the longest side, at least 2; the others have as many as make their cells as long, at least 2.
+        sides: lengths a, b, c of the sides.
+        n: number of cells along the longest side, at least 2. The other sides have cells of about the same length, at
+            least 2.
     """
     if np.shape(sides) != (3,):
-        raise ValueError(f"sides must be three lengths such as (1.0, 1.0, 2.0), found the shape {np.shape(sides)}.")
+        raise ValueError(f"sides must be three lengths such as (1.0, 1.0, 2.0), found shape {np.shape(sides)}.")
     n, lengths = at_least("n", n, 2), np.array([positive("each of the sides", side) for side in sides])
     counts = np.maximum(np.round(n * lengths / lengths.max()).astype(int), 2)
     vertices, faces, start = [], [], 0
@@ -159,10 +160,10 @@ def box(sides: tuple[float | int, float | int, float | int] = (1.0, 1.0, 1.0), n
         rows, columns = int(counts[(axis + 1) % 3]), int(counts[(axis + 2) % 3])
         lattice = np.indices((rows + 1, columns + 1)).reshape(2, -1)
         upwards = alternating_faces(rows + 1, columns + 1)
-        for level, sheet in ((0, upwards[:, ::-1]), (counts[axis], upwards)):
-            place = np.empty((lattice.shape[1], 3))
-            place[:, axis], place[:, (axis + 1) % 3], place[:, (axis + 2) % 3] = level, *lattice
-            vertices.append(place)
-            faces.append(sheet + start)
-            start += len(place)
+        for level, side_faces in ((0, upwards[:, ::-1]), (counts[axis], upwards)):
+            positions = np.empty((lattice.shape[1], 3))
+            positions[:, axis], positions[:, (axis + 1) % 3], positions[:, (axis + 2) % 3] = level, *lattice
+            vertices.append(positions)
+            faces.append(side_faces + start)
+            start += len(positions)
     return Mesh(np.concatenate(vertices) / counts * lengths, np.concatenate(faces), weld=True)

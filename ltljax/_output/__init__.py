@@ -1,4 +1,4 @@
-"""Results on disk and pictures. Never needed to compute; imported only where something is written.
+"""Files and pictures of results.
 
-What enters: NumPy arrays. What leaves: VTK series for ParaView, PLY with colours, PNG and MP4 (with the extra `viz`).
+All functions take NumPy arrays. This package is not needed to compute, and is imported only to write or draw.
 """

@@ -1,4 +1,4 @@
-"""Values become colours, without a plotting library."""
+"""Colour maps, without a plotting library."""
 
 import difflib
 
@@ -9,8 +9,8 @@ def _samples(digits: str) -> np.ndarray:
     return np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 3)
 
 
-# Evenly spaced samples, two hexadecimal digits a channel. Of matplotlib's tables: viridis, plasma, magma, inferno
-# (Smith and van der Walt, CC0), cividis (Nunez, Anderton and Renslow 2018), turbo (Mikhailov 2019), coolwarm
+# Evenly spaced samples, with two hexadecimal digits for each channel. Taken from matplotlib: viridis, plasma, magma and
+# inferno (Smith and van der Walt, CC0), cividis (Nunez, Anderton and Renslow 2018), turbo (Mikhailov 2019) and coolwarm
 # (Moreland 2009).
 COLORMAPS: dict[str, np.ndarray] = {
     "viridis": _samples(
@@ -42,37 +42,37 @@ COLORMAPS: dict[str, np.ndarray] = {
 
 
 def colormap_samples(name: str) -> np.ndarray:
-    """The samples (N, 3) of a colour map, evenly spaced from its low to its high end.
+    """The evenly spaced samples (N, 3) of a colour map, from low to high values.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: there is no colour map of this name.
     """
     if name not in COLORMAPS:
-        near = difflib.get_close_matches(name, COLORMAPS, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        raise ValueError(f"Expected a colour map of {', '.join(COLORMAPS)}, found {name!r}{hint}.")
+        matches = difflib.get_close_matches(name, COLORMAPS, n=1)
+        hint = f" (did you mean {matches[0]}?)" if matches else ""
+        raise ValueError(f"Expected one of the colour maps {', '.join(COLORMAPS)}, found {name!r}{hint}.")
     return COLORMAPS[name]
 
 
 def striped(colormap: str, count: int) -> np.ndarray:
-    """Samples (N, 3) of a colour map in so many bands, every second one darker, whose borders are contours."""
+    """Samples (N, 3) of a colour map in ``count`` bands, alternately light and dark, whose edges look like contours."""
     table = colormap_samples(colormap)
-    # Of a band, so many samples that its border is sharp.
-    place = np.linspace(0, 1, 64 * count)
-    samples = np.stack([np.interp(place, np.linspace(0, 1, len(table)), channel) for channel in table.T], axis=1)
-    is_dark = np.arange(len(place)) // 64 % 2 == 1
+    per_band = 64  # enough samples for sharp edges
+    position = np.linspace(0, 1, per_band * count)
+    samples = np.stack([np.interp(position, np.linspace(0, 1, len(table)), channel) for channel in table.T], axis=1)
+    is_dark = np.arange(len(position)) // per_band % 2 == 1
     return np.round(np.where(is_dark[:, None], 0.6, 1.0) * samples).astype(np.uint8)
 
 
 def vertex_colors(
     values: np.ndarray, limits: tuple[float, float] | None = None, colormap: str = "viridis"
 ) -> np.ndarray:
-    """RGBA colours (V, 4) of unsigned bytes, from one end of a colour map at the lower limit to the other at the upper.
+    """The RGBA colours (V, 4), unsigned bytes, of values on a colour map.
 
     Args:
-        values: (V,) numbers; one that is not finite becomes grey.
-        limits: the two ends; by default the least and the largest finite value.
-        colormap: one of `COLORMAPS`.
+        values: (V,) values; NaN and infinite values become grey.
+        limits: values at the ends of the colour map; by default, the smallest and the largest finite value.
+        colormap: name of a colour map, a key of `COLORMAPS`.
     """
     table = colormap_samples(colormap)
     is_finite = np.isfinite(values)

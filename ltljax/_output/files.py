@@ -1,4 +1,4 @@
-"""Surfaces and their fields as files: VTK and time series for ParaView, PLY and GLB with colours, OBJ, STL, 3MF."""
+"""Writers of mesh files: VTK and time series for ParaView, PLY and GLB with colours, OBJ, STL and 3MF."""
 
 import base64
 import json
@@ -21,22 +21,22 @@ def write_ply(
     colors: np.ndarray,
     fields: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a binary PLY with per-vertex colours (V, 3) or (V, 4) of unsigned bytes.
+    """Write a binary PLY with a colour for each vertex.
 
-    Positions are floats, which all programs read, or doubles where floats would blur the shape.
+    Positions are single-precision, which all programs read. They are double-precision for a shape far from the origin.
 
     Args:
-        path: where to.
-        vertices: (V, 3).
-        faces: (F, 3).
-        colors: per vertex.
-        fields: further columns by name, (V,), or (V, C), whose columns are called ``name_0`` and so on.
+        path: path of the file.
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        colors: (V, 3) or (V, 4) colours, unsigned bytes.
+        fields: further columns (V,) or (V, C) by name; the columns of the latter are named ``name_0``, ``name_1``, ...
     """
     size, name = ("f8", "double") if np.any(far_middle(vertices)) else ("f4", "float")
     channels = ("red", "green", "blue", "alpha")[: colors.shape[1]]
     columns = scalar_columns(fields or {})
-    if taken := {"x", "y", "z", *channels} & columns.keys():
-        raise ValueError(f"A PLY file has a column {min(taken)!r} of its own. Give the field another name.")
+    if reserved := {"x", "y", "z", *channels} & columns.keys():
+        raise ValueError(f"PLY reserves the name {min(reserved)!r} for positions or colours. Rename the field.")
     kinds = {name: _ply_type(values.dtype) for name, values in columns.items()}
     points = np.zeros(
         len(vertices),
@@ -67,31 +67,31 @@ _PLY_TYPES = {
 
 
 def _ply_type(dtype: np.dtype) -> str:
-    """The type of a column, as NumPy calls it; 64-bit integers, which PLY has not, become doubles."""
+    """The NumPy type code of a column; 64-bit integers become doubles, because PLY does not support them."""
     kind = "u1" if dtype.kind == "b" else dtype.str[1:]
     return kind if kind in _PLY_TYPES else "f8"
 
 
 def scalar_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Fields (V,) and (V, C) as columns (V,), those of the latter with numbers behind their names.
+    """Fields (V,) and (V, C) as columns (V,); the columns of the latter are named ``name_0``, ``name_1``, ...
 
     Raises:
-        ValueError: two columns have the same name, or one has a space or letters beyond ASCII, which such files cannot
-            hold.
+        ValueError: two columns have the same name, or a name has spaces or characters beyond ASCII, which files of
+            columns cannot store.
     """
     columns: dict[str, np.ndarray] = {}
     for name, values in fields.items():
         if not name.isascii() or " " in name or "end_header" in name:
-            raise ValueError(f"Expected names of fields in ASCII and without spaces, found {name!r}.")
+            raise ValueError(f"Expected field names in ASCII and without spaces, found {name!r}. Rename the field.")
         parts = {name: values} if values.ndim == 1 else {f"{name}_{i}": part for i, part in enumerate(values.T)}
-        if twice := parts.keys() & columns.keys():
-            raise ValueError(f"Two columns would be called {min(twice)!r}. Give the fields other names.")
+        if duplicates := parts.keys() & columns.keys():
+            raise ValueError(f"Two columns would have the name {min(duplicates)!r}. Rename the fields.")
         columns |= parts
     return columns
 
 
 def write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary STL, whose numbers are in float32; of a shape far from the origin those about its middle."""
+    """Write a binary STL in float32; positions of a shape far from the origin are relative to its middle."""
     vertices = vertices - far_middle(vertices)
     triangles = np.zeros(len(faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     corners = vertices[faces]
@@ -102,7 +102,7 @@ def write_stl(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def write_3mf(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a 3MF file, as printers take it, whose unit is the millimetre.
+    """Write a 3MF file for 3D printing, with the millimetre as unit.
 
     Source: 3D Manufacturing Format, core specification 1.3, chapters 2 (the package) and 4 (meshes).
     """
@@ -138,12 +138,12 @@ def write_obj(
     """Write an OBJ.
 
     Args:
-        path: where to.
-        vertices: (V, 3).
-        faces: (F, 3).
-        uv: (F, 3, 2) places in an image of the corners of every face.
-        material: the name of an MTL file beside it, whose material ``surface`` the faces have.
-        colors: (V, 3), from 0 to 1, which follow the positions; not all programs read them.
+        path: path of the file.
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        uv: (F, 3, 2) texture coordinates of the corners of every face.
+        material: name of the MTL file that defines the material ``surface`` of the faces.
+        colors: (V, 3) vertex colours from 0 to 1, which not all programs read.
     """
     lines = [] if material is None else [f"mtllib {material}", "usemtl surface"]
     rows = vertices if colors is None else np.concatenate([vertices, colors], axis=1)
@@ -151,36 +151,36 @@ def write_obj(
     if uv is None:
         lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     else:
-        places, index = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
+        unique_uv, index = np.unique(uv.reshape(-1, 2), axis=0, return_inverse=True)
         corners = np.stack([faces + 1, index.reshape(faces.shape) + 1], axis=2)
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in places.tolist()]
-        lines += ["f " + " ".join(f"{vertex}/{place}" for vertex, place in face) for face in corners.tolist()]
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in unique_uv.tolist()]
+        lines += ["f " + " ".join(f"{vertex}/{texture}" for vertex, texture in face) for face in corners.tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def write_glb(
     path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, normals: np.ndarray | None = None
 ) -> None:
-    """Write a binary glTF with per-vertex colours, which browsers and Blender open.
+    """Write a binary glTF with a colour for each vertex, which browsers and Blender open.
+
+    Positions of a shape far from the origin are relative to its middle, and the node has the corresponding translation.
 
     Args:
-        path: where to.
-        vertices: (V, 3).
-        faces: (F, 3).
-        colors: (V, 4) of unsigned bytes, as screens show them.
-        normals: (V, 3), for smooth shading.
-
-    Positions of a shape far from the origin are relative to its middle, to where its node is moved.
+        path: path of the file.
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        colors: (V, 4) sRGB colours, unsigned bytes.
+        normals: (V, 3) normals for smooth shading.
 
     Source: glTF 2.0 specification, sections 3.7 (attributes) and 4.4 (the container).
     """
     middle = far_middle(vertices)
-    # glTF wants colours in proportion to light; those of screens are bent (IEC 61966-2-1).
-    screen = colors[:, :3] / 255.0
-    light = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
+    # glTF stores linear colours. The conversion from sRGB is defined in IEC 61966-2-1.
+    srgb = colors[:, :3] / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     parts = {
         "POSITION": np.asarray(vertices - middle, "<f4"),
-        "COLOR_0": np.concatenate([light, colors[:, 3:] / 255.0], axis=1).astype("<f4"),
+        "COLOR_0": np.concatenate([linear, colors[:, 3:] / 255.0], axis=1).astype("<f4"),
     }
     if normals is not None:
         parts["NORMAL"] = np.asarray(normals, "<f4")
@@ -196,14 +196,14 @@ def write_glb(
         for index, (part, kind) in enumerate(zip(data, kinds, strict=True))
     ]
     accessors[0] |= dict(min=data[0].min(axis=0).tolist(), max=data[0].max(axis=0).tolist())
-    paint = dict(baseColorFactor=[1, 1, 1, 1], metallicFactor=0, roughnessFactor=0.9)
+    appearance = dict(baseColorFactor=[1, 1, 1, 1], metallicFactor=0, roughnessFactor=0.9)
     primitive = dict(attributes={name: i for i, name in enumerate(parts)}, indices=len(parts), material=0)
     tree = dict(
         asset=dict(version="2.0", generator="ltljax"),
         scene=0,
         scenes=[dict(nodes=[0])],
         nodes=[dict(mesh=0, **(dict(translation=middle.tolist()) if middle.any() else {}))],
-        materials=[dict(pbrMetallicRoughness=paint, doubleSided=True)],
+        materials=[dict(pbrMetallicRoughness=appearance, doubleSided=True)],
         meshes=[dict(primitives=[primitive])],
         accessors=accessors,
         bufferViews=views,
@@ -223,10 +223,16 @@ def write_vtp(
     fields: Mapping[str, np.ndarray],
     unstructured: bool = False,
 ) -> None:
-    """Write a VTK PolyData file (``.vtp``), or an unstructured grid (``.vtu``), with fields (V,) or (V, C).
+    """Write a VTK PolyData file (``.vtp``) or unstructured grid (``.vtu``) in XML with compressed arrays.
 
-    XML with compressed arrays inside, which ParaView and every VTK reader open. Written here so that results can be
-    kept where no VTK is installed.
+    This does not need VTK.
+
+    Args:
+        path: path of the file.
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        fields: (V,) or (V, C) fields by name.
+        unstructured: whether to write an unstructured grid.
 
     Source: VTK file formats, section XML.
     """
@@ -235,7 +241,7 @@ def write_vtp(
     cells = f"{_array('connectivity', faces.ravel().astype(np.int64))}{_array('offsets', offsets)}"
     if unstructured:
         kind, counts = "UnstructuredGrid", f'NumberOfCells="{len(faces)}"'
-        triangle = 5  # VTK's number for it
+        triangle = 5  # VTK's number for this type of cell
         cells = f"<Cells>\n{cells}{_array('types', np.full(len(faces), triangle, np.uint8))}</Cells>\n"
     else:
         kind = "PolyData"
@@ -255,7 +261,7 @@ def write_vtp(
 
 
 def write_series(path: Path, times: np.ndarray, files: list[str]) -> None:
-    """Write a ParaView collection (``.pvd``): one file, named relative to the collection, for each time."""
+    """Write a ParaView collection (``.pvd``) of times and files; file names are relative to the collection."""
     entries = "".join(
         f'<DataSet timestep="{time:.17g}" file={quoteattr(file)}/>\n' for time, file in zip(times, files, strict=True)
     )
@@ -278,7 +284,8 @@ def _array(name: str, values: np.ndarray) -> str:
     kind = _VTK_TYPES[values.dtype.str[1:]]
     components = values.shape[1] if values.ndim == 2 else 1
     compressed = zlib.compress(values.tobytes(), level=4)
-    # One block, its size, no partial block at the end, its compressed size; encoded apart from the block.
+    # The number of blocks, the size of a block, the size of the last partial block, and the compressed size of each
+    # block. The header is encoded separately from the block.
     header = np.array([1, values.nbytes, 0, len(compressed)], "<u8").tobytes()
     data = (base64.b64encode(header) + base64.b64encode(compressed)).decode("ascii")
     return (

@@ -1,15 +1,16 @@
-"""The viewer: a run as one HTML file that any browser opens, offline too.
+"""The viewer: a run in a single HTML file that any browser opens, even offline.
 
-What enters: NumPy arrays of a surface and of its states in time. What leaves: a page with the surface to turn, a time
-slider, a choice of species and colours, the value under the pointer, and pictures to save.
+The page shows the surface, which can be rotated, with a time slider, menus of species and colour maps, the value under
+the pointer, and a button that saves a picture.
 
-The page stores the geometry once: positions in 16 bits of the bounding box, faces in 32. The states of each species are
-stored as whole numbers of steps, into 65,534 of which the range they take over all times is divided (65535 where not
-finite), as differences from the frame before (0, -1, 1, -2, ... as 0, 1, 2, 3, ...), low bytes apart from high ones,
-deflated. Where this makes a page of more than 14 MB (or, of more vertices and times than 40,000 and 100, more than 3.5
-letters for each) the steps are coarser: of two species in motion there are ten thousand left, of five a hundred and
-fifty; still more species make larger pages. It is drawn by three.js (MIT licence, beside this file); viewer.js says how
-the bundle is made.
+The geometry is stored once: positions as 16-bit fractions of the bounding box, faces as 32-bit integers. The states of
+each species are quantised: the range of its values over all times is divided into 65,534 steps, and 65535 stands for
+NaN and infinite values. The differences between successive frames (0, -1, 1, -2, ... stored as 0, 1, 2, 3, ...) are
+compressed, low bytes separately from high bytes. If the page would exceed 14 million characters, or 3.5 characters for
+each vertex and time if that is more, the steps are coarser: about 10,000 for two species in motion and 150 for five.
+With more species the page becomes larger.
+
+The page is drawn by three.js (MIT licence, in this folder). package.json defines how bundle.js is built from viewer.js.
 """
 
 import base64
@@ -25,9 +26,9 @@ import numpy as np
 from ..colors import COLORMAPS, colormap_samples
 
 _MISSING = 65535
-# Letters of the states of a page: what opens on a phone, and of larger runs so many for each vertex and time.
-_PAGE, _LETTERS = 14_000_000, 3.5
-# Into how many steps a range is divided, at the most and at the least.
+# Largest number of characters of a page, which a phone can open, and, for larger runs, for each vertex and time.
+_PAGE, _PER_VALUE = 14_000_000, 3.5
+# Largest and smallest number of steps of a range.
 _FINEST, _COARSEST = 65534, 127
 
 
@@ -39,18 +40,18 @@ def viewer_html(
     title: str = "",
     colormap: str = "viridis",
 ) -> str:
-    """The page, as a text.
+    """The HTML of the page.
 
     Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-        times: (T,) ascending; states at infinite times, which a run has not reached, are left out.
-        fields: (T, V) for each species by name.
-        title: what stands at the top.
-        colormap: the one it opens with, of `ltl.io.COLORMAPS`.
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices.
+        times: (T,) ascending times; states at infinite times, which the run did not reach, are left out.
+        fields: (T, V) states of each species by name.
+        title: title at the top of the page.
+        colormap: name of the initial colour map, a key of `ltl.io.COLORMAPS`.
 
     Raises:
-        ValueError: shapes do not fit, there is no state, or the colour map is not known.
+        ValueError: the shapes do not match, there is no state, or the colour map is not known.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     times = np.asarray(times, np.float64)
@@ -65,13 +66,14 @@ def viewer_html(
         positions=_compressed(np.round((vertices - low) / span * 65535).astype("<u2").tobytes()),
         faces=_compressed(faces.astype("<u4").tobytes()),
     )
-    room_for_each = (max(_PAGE, _LETTERS * len(vertices) * len(times)) - sum(map(len, arrays.values()))) / len(fields)
+    size_limit = max(_PAGE, _PER_VALUE * len(vertices) * len(times))
+    limit_per_species = (size_limit - sum(map(len, arrays.values()))) / len(fields)
     species = []
     for index, (name, values) in enumerate(fields.items()):
         if np.shape(values) != (num_states, len(vertices)):
             raise ValueError(f"Expected {name} of shape {(num_states, len(vertices))}, found {np.shape(values)}.")
-        limits, whole = _quantised(np.asarray(values)[is_reached])
-        steps, arrays[f"field-{index}"] = _packed(whole, room_for_each)
+        limits, quantised = _quantised(np.asarray(values)[is_reached])
+        steps, arrays[f"field-{index}"] = _packed(quantised, limit_per_species)
         species.append(dict(name=name, low=limits[0], high=limits[1], steps=steps))
     header = dict(
         title=title,
@@ -85,12 +87,12 @@ def viewer_html(
     )
     scripts = [_script("header", "application/json", json.dumps(header).replace("<", "\\u003c"))]
     scripts += [_script(name, "text/plain", text) for name, text in arrays.items()]
-    room = files("ltljax._output.viewer")
-    page = room.joinpath("viewer.html").read_text(encoding="utf-8")
-    # Nothing in the bundle may end the script it stands in.
-    bundle = room.joinpath("bundle.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
-    # Split once: a title may spell the marks too.
-    before, rest = page.split("@data@")
+    folder = files("ltljax._output.viewer")
+    template = folder.joinpath("viewer.html").read_text(encoding="utf-8")
+    # An end tag in the bundle would end the script element that contains it.
+    bundle = folder.joinpath("bundle.js").read_text(encoding="utf-8").replace("</script", "<\\/script")
+    # The template is split before the data are inserted, because a title may contain the placeholders too.
+    before, rest = template.split("@data@")
     between, after = rest.split("@bundle@")
     return "".join([before, "\n".join(scripts), between, bundle, after])
 
@@ -104,16 +106,16 @@ def write_viewer(
     title: str = "",
     colormap: str = "viridis",
 ) -> None:
-    """Write the page; arguments as of `viewer_html`."""
+    """Write the page to a file; the other arguments are those of `viewer_html`."""
     path.write_text(viewer_html(vertices, faces, times, fields, title, colormap), encoding="utf-8")
 
 
 class Inline:
-    """A page inside a notebook: what a cell shows that ends with this.
+    """A page that a notebook shows in the output of a cell.
 
     Args:
-        page: its HTML.
-        height: in pixels.
+        page: HTML of the page.
+        height: height in pixels.
     """
 
     def __init__(self, page: str, height: int = 560):
@@ -133,7 +135,7 @@ def _compressed(data: bytes) -> str:
 
 
 def _quantised(values: np.ndarray) -> tuple[tuple[float, float], np.ndarray]:
-    """The range of the values (T, V), and where in it each lies, in the finest steps."""
+    """The range of the values (T, V), and the values in units of the finest step, (T, V)."""
     low, high = np.inf, -np.inf
     for frame in values:
         finite = frame[np.isfinite(frame)]
@@ -141,26 +143,26 @@ def _quantised(values: np.ndarray) -> tuple[tuple[float, float], np.ndarray]:
     low, high = (float(low), float(high)) if low <= high else (0.0, 1.0)
     if not high > low:
         high = low + max(abs(low), 1.0) * 1e-3
-    whole = np.empty(values.shape, np.uint16)
-    for frame, target in zip(values, whole, strict=True):
+    quantised = np.empty(values.shape, np.uint16)
+    for frame, target in zip(values, quantised, strict=True):
         is_finite = np.isfinite(frame)
-        share = (np.where(is_finite, frame, low).astype(np.float64) - low) / (high - low)
-        target[:] = np.where(is_finite, np.round(share * _FINEST), _MISSING)
-    return (low, high), whole
+        fraction = (np.where(is_finite, frame, low).astype(np.float64) - low) / (high - low)
+        target[:] = np.where(is_finite, np.round(fraction * _FINEST), _MISSING)
+    return (low, high), quantised
 
 
-def _packed(whole: np.ndarray, most: float) -> tuple[int, str]:
-    """Into how many steps the range is divided, and the states (T, V), of at most so many letters if that can be."""
+def _packed(quantised: np.ndarray, limit: float) -> tuple[int, str]:
+    """The number of steps of the range, and the packed states (T, V), with at most ``limit`` characters if possible."""
     steps = _FINEST
     while True:
-        rounded = (whole.astype(np.uint32) * steps + _FINEST // 2) // _FINEST
-        rounded = np.where(whole == _MISSING, _MISSING, rounded).astype(np.uint16)
-        change = np.diff(rounded, axis=0, prepend=np.zeros((1, whole.shape[1]), np.uint16))
+        rounded = (quantised.astype(np.uint32) * steps + _FINEST // 2) // _FINEST
+        rounded = np.where(quantised == _MISSING, _MISSING, rounded).astype(np.uint16)
+        change = np.diff(rounded, axis=0, prepend=np.zeros((1, quantised.shape[1]), np.uint16))
         signed = change.view(np.int16)
         change = ((signed << 1) ^ (signed >> 15)).view(np.uint16)
         text = _compressed((change & 255).astype(np.uint8).tobytes() + (change >> 8).astype(np.uint8).tobytes())
-        if len(text) <= most or steps == _COARSEST:
+        if len(text) <= limit or steps == _COARSEST:
             return steps, text
-        # One bit of each state is an eighth of a byte, and three bytes are four letters.
-        excess = (len(text) - most) / whole.size * 6
-        steps = max(_COARSEST, int(steps / 2 ** max(excess, 0.25)))
+        # The number of bits to save for each value: six bits make a character.
+        excess_bits = (len(text) - limit) / quantised.size * 6
+        steps = max(_COARSEST, int(steps / 2 ** max(excess_bits, 0.25)))

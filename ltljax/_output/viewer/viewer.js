@@ -1,33 +1,34 @@
-// The viewer's source. What the package ships is bundle.js, made of this file and three.js:
+// The source of the viewer. The page contains bundle.js, which is built from this file and three.js:
 //
-//   npm install three@0.187 esbuild@0.28
-//   npx esbuild viewer.js --bundle --minify --format=iife --legal-comments=none --outfile=bundle.js
+//   npm ci --ignore-scripts && npm run build
 //
-// The page holds one JSON script "header" and one base64 text for each array, deflated: see __init__.py for the layout.
+// .ci/check_viewer_bundle checks that the bundle is up to date. The page has a JSON script "header", and a script of
+// compressed base64 data for each array; __init__.py describes the layout.
 import {
   BufferAttribute, BufferGeometry, Color, DataTexture, DoubleSide, LinearFilter, Mesh, PerspectiveCamera, RGBAFormat,
   Raycaster, Scene, ShaderMaterial, Vector2, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
-const MISSING = 65535; // stands for what is not finite
-const SECONDS = 12; // of a whole animation
+const MISSING = 65535; // stands for NaN and infinite values
+const SECONDS = 12; // duration of the animation
 
 const by = (id) => document.getElementById(id);
 
 async function inflate(text) {
-  const raw = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const raw = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
   const stream = new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Low bytes first, then high ones, of the differences from the frame before: 0, -1, 1, -2, ... as 0, 1, 2, 3, ...
+// The bytes are the low bytes and then the high bytes of the differences between successive frames: 0, -1, 1, -2, ... are
+// stored as 0, 1, 2, 3, ...
 function frames(bytes, count, size) {
   const values = new Uint16Array(count * size);
   const high = count * size;
   for (let i = 0; i < count * size; i++) {
-    const kept = bytes[i] | (bytes[high + i] << 8);
-    const change = ((kept >>> 1) ^ -(kept & 1)) & 65535;
+    const code = bytes[i] | (bytes[high + i] << 8);
+    const change = ((code >>> 1) ^ -(code & 1)) & 65535;
     values[i] = i < size ? change : (values[i - size] + change) & 65535;
   }
   return values;
@@ -64,10 +65,10 @@ const VERTEX = `
   void main() {
     missing = max(step(0.99999, before), step(0.99999, after));
     value = mix(before, after, share) * 65535.0 / steps;
-    vec4 there = modelViewMatrix * vec4(position, 1.0);
+    vec4 viewed = modelViewMatrix * vec4(position, 1.0);
     facing = normalMatrix * normal;
-    seen = -there.xyz;
-    gl_Position = projectionMatrix * there;
+    seen = -viewed.xyz;
+    gl_Position = projectionMatrix * viewed;
   }`;
 const FRAGMENT = `
   uniform sampler2D map;
@@ -84,14 +85,14 @@ const FRAGMENT = `
   }`;
 
 function pretty(number) {
-  if (!Number.isFinite(number)) return "not a number";
+  if (!Number.isFinite(number)) return "NaN";
   const size = Math.abs(number);
   return size !== 0 && (size < 1e-3 || size >= 1e5) ? number.toExponential(3) : String(Number(number.toPrecision(4)));
 }
 
 async function start() {
   const header = JSON.parse(by("header").textContent);
-  if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old: it cannot inflate data");
+  if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old to decompress the data");
   const array = (id) => inflate(by(id).textContent.trim());
   const size = header.vertices, count = header.times.length;
   const [points, corners, ...fields] = await Promise.all([
@@ -117,7 +118,7 @@ async function start() {
 
   const canvas = by("scene");
   const renderer = new WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
-  renderer.outputColorSpace = "srgb-linear"; // the colour maps are screen colours already
+  renderer.outputColorSpace = "srgb-linear"; // no conversion, because the colour maps are in sRGB
   renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
   const camera = new PerspectiveCamera(35, 1, 0.01, 1000);
   const controls = new OrbitControls(camera, canvas);
@@ -126,7 +127,7 @@ async function start() {
 
   const state = { at: 0, species: 0, colormap: header.colormap, playing: false, shown: [-1, -1, -1] };
   let stale = true, moved = false;
-  // What is seen has changed, and with it what lies under the pointer.
+  // Marks the picture, and with it the value under the pointer, as out of date.
   const refresh = () => { stale = moved = true; };
   controls.addEventListener("change", refresh);
 
@@ -177,7 +178,7 @@ async function start() {
   }
 
   function setSpecies(name) {
-    state.species = Math.max(0, header.species.findIndex((one) => one.name === name));
+    state.species = Math.max(0, header.species.findIndex((species) => species.name === name));
     const { low, high, steps } = header.species[state.species];
     uniforms.steps.value = steps;
     by("low").textContent = pretty(low);
@@ -239,11 +240,11 @@ async function start() {
     asked = now;
     moved = false;
     answers += 1;
-    const found = valueAt(...pointer);
+    const hit = valueAt(...pointer);
     const label = by("value");
-    label.hidden = found === null;
-    if (found === null) return;
-    label.textContent = `${header.species[state.species].name} = ${pretty(found.value)}`;
+    label.hidden = hit === null;
+    if (hit === null) return;
+    label.textContent = `${header.species[state.species].name} = ${pretty(hit.value)}`;
     label.style.left = `${Math.min(pointer[0] + 14, window.innerWidth - label.offsetWidth - 8)}px`;
     label.style.top = `${Math.max(pointer[1] - 34, 8)}px`;
   }
@@ -272,7 +273,7 @@ async function start() {
   canvas.addEventListener("pointermove", point);
   canvas.addEventListener("pointerdown", point);
   canvas.addEventListener("pointerleave", (event) => {
-    if (event.pointerType === "touch") return; // a finger that is lifted: what it touched stays to be read
+    if (event.pointerType === "touch") return; // the value stays when the finger is lifted
     pointer = null;
     by("value").hidden = true;
   });
@@ -319,7 +320,7 @@ async function start() {
     get drawn() { return drawn; },
     get answers() { return answers; },
     get distance() { return camera.position.distanceTo(controls.target); },
-    // What is stored of one vertex in one frame.
+    // The stored value of a vertex in a frame.
     stored(species, frame, vertex) {
       const { low, high, steps } = header.species[species], whole = states[species][frame * size + vertex];
       return whole === MISSING ? NaN : low + ((high - low) * whole) / steps;
