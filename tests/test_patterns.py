@@ -113,8 +113,7 @@ def test_the_first_wavelength_is_that_of_linear_theory(name):
     assert contents.species[0] in ("u", "g")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "level"), [("stripes", 4), ("holes", 4), ("spots", 5)])
+@pytest.mark.parametrize(("kind", "level"), [("stripes", 4), slow("holes", 4), slow("spots", 5)])
 def test_the_brusselators_first_wavelength_outgrows_its_oscillation(kind, level):
     """The uniform state oscillates slowly (b > 1 + a^2), and patterns grow at least three times as fast.
 
