@@ -1,11 +1,12 @@
-"""What inverse problems cost: gradients over forward runs, solves to converge beside SciPy, many starts at once.
+"""The cost of inverse problems: gradients against forward runs, fits against SciPy, and many starts at once.
 
 python benchmarks/inverse.py [--parts gradient protocol solves starts]
 
-Gradients are of the mean square of a final state with respect to a source field, Schnakenberg's reaction and steps of
-the default solver, by the default adjoint and by diffrax's recursive checkpoints, whose number is the root of twice the
-steps allowed. Times are medians of the second call on, all in turns; memory is what XLA reserves beside arguments and
-results. SciPy's `least_squares` takes finite differences of the same compiled model.
+The gradient is of the mean square of a final state with respect to a source field, with Schnakenberg's reaction and the
+steps of the default solver. It is computed with the default adjoint and with diffrax's recursive checkpoints, whose
+number is the root of twice the largest number of steps. Times are medians from the second call on, with all programs in
+turn. Memory is the amount that XLA reserves in addition to arguments and results. SciPy's `least_squares` takes finite
+differences of the same compiled model.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from scipy import optimize  # noqa: E402
 
 import ltljax as ltl  # noqa: E402
 
-# Level of the icosphere, fixed steps or the end of a run of adaptive ones, unknowns (None: one for each vertex).
+# Level of the icosphere, number of fixed steps or end of an adaptive run, number of unknowns (None: one per vertex).
 RUNS = (
     (5, 250, None), (5, 1000, None), (5, 4000, None), (5, 8000, None),
     (5, 1000, 1), (5, 1000, 100), (4, 1000, None), (6, 1000, None), (4, 0.5, None), (4, 5.0, None), (5, 0.5, None),
@@ -59,15 +60,15 @@ def gradient():
         surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(level))
         u0, steps = start_of(surface), length if isinstance(length, int) else None
         size = surface.num_vertices if unknowns is None else unknowns
-        # Unknowns are the values of a field that is constant over runs of vertices.
+        # The unknowns are the values of a field that is constant over ranges of vertices.
         owner = np.arange(surface.num_vertices) * size // surface.num_vertices
         end, how = (length, {}) if steps is None else (2e-4 * steps, dict(dt=2e-4))
 
         def loss(field, surface, u0, adjoint, owner=owner, end=end, how=how):
             a = jnp.take(field, owner)
             equation = ltl.ReactionDiffusion((1.0, 10.0), ltl.kinetics.schnakenberg(a, 0.9, rate=30.0))
-            found = ltl.solve(equation, surface, u0, end, None, ltl.RKL2(), adjoint, **how)
-            return jnp.mean(found.u_end**2), found.counts["num_steps"]
+            solution = ltl.solve(equation, surface, u0, end, None, ltl.RKL2(), adjoint, **how)
+            return jnp.mean(solution.u_end**2), solution.counts["num_steps"]
 
         field, runs, compiling = jnp.full(size, 0.1), [], []
         checkpoints = diffrax.RecursiveCheckpointAdjoint(checkpoints=math.isqrt(2 * (steps or 1_000_000)) + 1)
@@ -80,23 +81,23 @@ def gradient():
             compiling.append(time.perf_counter() - begin)
         seconds, count = [[] for _ in runs], 0
         for _ in range((2 if (steps or 0) > 1000 or level > 5 else ROUNDS) + 1):
-            for run, found in zip(runs, seconds, strict=True):
+            for run, times in zip(runs, seconds, strict=True):
                 begin = time.perf_counter()
                 out = jax.block_until_ready(run(field, surface, u0))
-                found.append(time.perf_counter() - begin)
+                times.append(time.perf_counter() - begin)
                 count = int(out[1] if run is runs[0] else out[0][1])
-        there, back, theirs = (float(np.median(found[1:])) for found in seconds)
+        forward, ours, theirs = (float(np.median(times[1:])) for times in seconds)
         memory = [run.memory_analysis().temp_size_in_bytes / 1e6 for run in runs]
         print(
-            f"| {surface.num_vertices} | {count}{'' if steps else ', adaptive'} | {size} | {there:.2f} | {back:.2f} | "
-            f"{back / there:.2f} | {memory[1]:.0f} | {compiling[1]:.1f} | {theirs / there:.2f} | {memory[2]:.0f} | "
-            f"{compiling[2]:.1f} |",
+            f"| {surface.num_vertices} | {count}{'' if steps else ', adaptive'} | {size} | {forward:.2f} | "
+            f"{ours:.2f} | {ours / forward:.2f} | {memory[1]:.0f} | {compiling[1]:.1f} | {theirs / forward:.2f} | "
+            f"{memory[2]:.0f} | {compiling[2]:.1f} |",
             flush=True,
         )
 
 
 def eight_unknowns():
-    """Schnakenberg's rates, diffusivities and a rate that varies in space: model, truth, first guess, times."""
+    """The model, truth, first guess and times of a fit of rates, diffusivities and a rate that varies in space."""
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
     x = surface.vertices
 
@@ -116,10 +117,10 @@ def solves():
     rows = []
     for label in ("first call", "second call"):
         begin = time.perf_counter()
-        found = ltl.fit(experiment, start, data)
-        rows.append(("ltljax, Levenberg-Marquardt", label, found.num_runs, time.perf_counter() - begin, found.params))
+        fit = ltl.fit(experiment, start, data)
+        rows.append(("ltljax, Levenberg-Marquardt", label, fit.num_runs, time.perf_counter() - begin, fit.params))
     flat, rebuild = ravel_pytree(jax.tree.map(jnp.asarray, start))
-    # A run that diverges is far from the data; SciPy takes no infinity, which it is for ltljax.
+    # The residuals of a diverged run are infinite in ltljax; SciPy accepts only finite ones.
     residuals = jax.jit(lambda z: jnp.nan_to_num(data.misfit(experiment(rebuild(z), times)), nan=1e8))
     np.asarray(residuals(flat))
     for method in ("trf", "lm"):
@@ -138,14 +139,14 @@ def solves():
         rows.append(
             (f"SciPy, {method}", "compiled before", count, time.perf_counter() - begin, rebuild(jnp.asarray(theirs.x)))
         )
-    wanted = np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, truth))[0])
+    exact = np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, truth))[0])
     print(
         "\n### Eight unknowns of Schnakenberg's reaction from three snapshots, 642 vertices\n\n"
         "| method | | runs of the model | seconds | largest error |\n| --- | --- | --- | --- | --- |"
     )
     for name, label, count, seconds, params in rows:
-        off = np.abs(np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, params))[0]) - wanted)
-        print(f"| {name} | {label} | {count} | {seconds:.1f} | {np.max(off / np.maximum(np.abs(wanted), 1)):.1e} |")
+        errors = np.abs(np.asarray(ravel_pytree(jax.tree.map(jnp.asarray, params))[0]) - exact)
+        print(f"| {name} | {label} | {count} | {seconds:.1f} | {np.max(errors / np.maximum(np.abs(exact), 1)):.1e} |")
     ours, theirs = rows[1], rows[2]
     print(
         f"\nSciPy over ltljax: {theirs[2] / ours[2]:.1f} times the runs, {theirs[3] / ours[3]:.1f} times the seconds."
@@ -171,17 +172,17 @@ def starts():
         seconds = []
         for _ in range(2):
             begin = time.perf_counter()
-            found = ltl.inverse.fit_many(experiment, many, data, transforms=ltl.inverse.Positive())
-            jax.block_until_ready(found.losses)
+            fits = ltl.inverse.fit_many(experiment, many, data, transforms=ltl.inverse.Positive())
+            jax.block_until_ready(fits.losses)
             seconds.append(time.perf_counter() - begin)
-        assert np.allclose(np.asarray(found.params["a"]), 0.1, rtol=1e-3)
+        assert np.allclose(np.asarray(fits.params["a"]), 0.1, rtol=1e-3)
         ltl.fit(
             experiment, {key: float(values[0]) for key, values in many.items()}, data, transforms=ltl.inverse.Positive()
         )
         begin = time.perf_counter()
         for k in range(32):
-            one = {key: float(values[k]) for key, values in many.items()}
-            ltl.fit(experiment, one, data, transforms=ltl.inverse.Positive())
+            start = {key: float(values[k]) for key, values in many.items()}
+            ltl.fit(experiment, start, data, transforms=ltl.inverse.Positive())
         loop = time.perf_counter() - begin
         print(
             f"| {surface.num_vertices} | {seconds[1]:.1f} | {loop:.1f} | {loop / seconds[1]:.2f} | {seconds[0]:.1f} |",
@@ -190,7 +191,7 @@ def starts():
 
 
 def protocol():
-    """After Mosaic (arXiv 2606.27895): is the gradient of a long run that of differences, and what does it cost?"""
+    """The protocol of Mosaic (arXiv 2606.27895): the gradient of a long run against differences, and its cost."""
     print(
         "\n### Every solver's gradient with respect to eight unknowns, 2,500 steps, 162 vertices\n\n"
         "| solver | cosine to differences | largest entry | forward (s) | gradient over forward | MB |\n"
@@ -213,23 +214,23 @@ def protocol():
             equation = ltl.ReactionDiffusion((p["du"], p["dv"]), kinetics)
             return jnp.mean(ltl.solve(equation, surface, u0, count * dt, None, solver, dt=dt).u_end ** 2)
 
-        forward, back = (jax.jit(f).lower(flat).compile() for f in (loss, jax.grad(loss)))
-        # Central differences of the size that balances their own error against rounding.
+        forward, reverse = (jax.jit(f).lower(flat).compile() for f in (loss, jax.grad(loss)))
+        # Central differences with steps that balance truncation against rounding errors.
         steps = 1e-5 * np.maximum(np.abs(flat), 0.1)
         pairs = [(forward(flat.at[k].add(h)), forward(flat.at[k].add(-h))) for k, h in enumerate(steps)]
         differences = np.array([float(more - less) / (2 * h) for (more, less), h in zip(pairs, steps, strict=True)])
         seconds = [[], []]
         for _ in range(ROUNDS):
-            for run, taken in zip((forward, back), seconds, strict=True):
+            for run, times in zip((forward, reverse), seconds, strict=True):
                 begin = time.perf_counter()
                 gradient = jax.block_until_ready(run(flat))
-                taken.append(time.perf_counter() - begin)
+                times.append(time.perf_counter() - begin)
         gradient = np.asarray(gradient)
         cosine = gradient @ differences / (np.linalg.norm(gradient) * np.linalg.norm(differences))
-        there, both = (float(np.median(taken)) for taken in seconds)
+        forward_time, reverse_time = (float(np.median(times)) for times in seconds)
         print(
-            f"| {type(solver).__name__} | {cosine:.9f} | {np.abs(gradient).max():.3g} | {there:.3f} | "
-            f"{both / there:.1f} | {back.memory_analysis().temp_size_in_bytes / 1e6:.0f} |",
+            f"| {type(solver).__name__} | {cosine:.9f} | {np.abs(gradient).max():.3g} | {forward_time:.3f} | "
+            f"{reverse_time / forward_time:.1f} | {reverse.memory_analysis().temp_size_in_bytes / 1e6:.0f} |",
             flush=True,
         )
 

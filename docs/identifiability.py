@@ -1,4 +1,4 @@
-"""The figures of identifiability.md: what data tell about parameters, and what they do not.
+"""The figures of identifiability.md: what data determine about parameters.
 
 python docs/identifiability.py [PART ...]
 """
@@ -37,18 +37,18 @@ def schnakenberg(u0=U0):
     return ltl.inverse.Experiment(equation, SURFACE, u0)
 
 
-def say(title, found):
-    print(f"### {title}\n\n```\n{found}\n```\n", flush=True)
+def report(title, fit):
+    print(f"### {title}\n\n```\n{fit}\n```\n", flush=True)
 
 
 def growing_pattern():
     experiment, times = schnakenberg(), np.array([0.1, 0.25, 0.5])
     data = ltl.Observations(*noisy(experiment(TRUTH, times).us), times)
-    say("three snapshots of a growing pattern", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
+    report("three snapshots of a growing pattern", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
 
 
 def one_scale():
-    """A stationary pattern: the rate of the reaction and both diffusivities together are a unit of time."""
+    """A stationary pattern: a common factor of the reaction rate and both diffusivities is a unit of time."""
 
     def model(p, adjoint=None):
         equation = ltl.ReactionDiffusion((p["du"], p["dv"]), ltl.kinetics.schnakenberg(0.1, 0.9, rate=p["rate"]))
@@ -56,21 +56,22 @@ def one_scale():
 
     truth = dict(du=1.0, dv=10.0, rate=30.0)
     data = ltl.Observations(*noisy(model(jax.tree.map(jnp.asarray, truth))))
-    found = ltl.fit(model, dict(du=1.05, dv=10.3, rate=30.5), data, transforms=ltl.inverse.Positive(), max_steps=30)
-    say("one picture of a pattern that has become stationary", found)
+    start = dict(du=1.05, dv=10.3, rate=30.5)
+    fit = ltl.fit(model, start, data, transforms=ltl.inverse.Positive(), max_iterations=30)
+    report("one picture of a pattern that has become stationary", fit)
 
 
 def uniform_start():
-    """Where nothing varies nothing diffuses."""
+    """A uniform mixture, in which diffusion has no effect."""
     experiment, times = schnakenberg(np.array([1.5, 0.5]) + 0 * U0), np.array([0.05, 0.1, 0.2])
     values = np.asarray(experiment(TRUTH, times).us)
     level = 0.01 * values.std()
     data = ltl.Observations(values + level * RNG.normal(size=values.shape), level, times)
-    say("a uniform mixture", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
+    report("a uniform mixture", ltl.fit(experiment, GUESS, data, transforms=ltl.inverse.Positive()))
 
 
 def real_data():
-    """The first section's data as they come: wrong values, an unknown factor, gaps, a first guess far away."""
+    """The data of the first section with wrong values, an unknown factor, gaps, and a distant first guess."""
     experiment, times = schnakenberg(), np.array([0.1, 0.25, 0.5])
     clean, _ = noisy(experiment(TRUTH, times).us)
     chance = np.random.default_rng(2)
@@ -92,27 +93,27 @@ def real_data():
         ("a guess 300 times too large", fitted(clean, far)),
     )
     print("| data | status | a | b | d | outliers named |\n" + "| --- " * 6 + "|")
-    for title, found in cases:
-        low, high = found.intervals
-        values = [f"{found.params[key]:.5g} ({low[key]:.5g} to {high[key]:.5g})" for key in TRUTH]
-        print(f"| {title} | {found.status} | {' | '.join(values)} | {len(found.agreement.outliers)} |")
-    for title, found in cases[:4]:
-        say(title, found)
+    for title, fit in cases:
+        low, high = fit.intervals
+        values = [f"{fit.params[key]:.5g} ({low[key]:.5g} to {high[key]:.5g})" for key in TRUTH]
+        print(f"| {title} | {fit.status} | {' | '.join(values)} | {len(fit.agreement.outliers)} |")
+    for title, fit in cases[:4]:
+        report(title, fit)
     figure = cases[1][1].plot()
     figure.savefig("docs/real_data.png", dpi=90)
 
 
 def too_late():
-    """The first guess makes another pattern, and no small change of rates turns its spots into those that were seen."""
+    """A first guess that leads to another pattern, whose spots no small change of the rates turns into the data's."""
     experiment, times = schnakenberg(), np.array([2.0])
     data = ltl.Observations(*noisy(experiment(TRUTH, times).us), times)
-    say("one late picture, from a first guess 30 % off", ltl.fit(
-        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.inverse.Positive(), max_steps=40
+    report("one late picture, from a first guess 30 % off", ltl.fit(
+        experiment, dict(a=0.13, b=0.63, d=7.0), data, transforms=ltl.inverse.Positive(), max_iterations=40
     ))  # fmt: skip
 
 
 def faded():
-    """An initial state after its fine parts have decayed: amplitudes of harmonics, from a later state."""
+    """An initial state after its fine modes have decayed: amplitudes of harmonics, from a later state."""
     modes = ltl.eigenmodes(SURFACE, 49)
     vectors, truth = modes.vectors, jnp.asarray(RNG.normal(size=49))
 
@@ -120,14 +121,13 @@ def faded():
         return ltl.solve(ltl.Diffusion(), SURFACE, vectors @ p, 0.1, adjoint=adjoint, throw=False).u_end
 
     data = ltl.Observations(*noisy(model(truth)))
-    found = ltl.fit(model, np.zeros(49), data)
-    print(
-        "### an initial state from what is left of it at t = 0.1\n\n| degree | exp(-l(l+1) t) | std of an amplitude |"
-    )
+    fit = ltl.fit(model, np.zeros(49), data)
+    print("### an initial state from the state at t = 0.1\n\n| degree | exp(-l(l+1) t) | std of an amplitude |")
     print("| --- | --- | --- |")
     for degree in range(7):
-        own = slice(degree**2, (degree + 1) ** 2)
-        print(f"| {degree} | {np.exp(-degree * (degree + 1) * 0.1):.3f} | {found.evidence.std[own].mean():.2g} |")
+        modes_of_degree = slice(degree**2, (degree + 1) ** 2)
+        std = fit.evidence.std[modes_of_degree].mean()
+        print(f"| {degree} | {np.exp(-degree * (degree + 1) * 0.1):.3f} | {std:.2g} |")
     print()
 
 
@@ -144,7 +144,7 @@ class Conduction(ltl.Equation):
 
 
 def diffusivity_field():
-    """A diffusivity at every vertex from snapshots of what spreads, smoothed as the discrepancy rule says."""
+    """A diffusivity at every vertex from snapshots, with a smoothness weight from the discrepancy principle."""
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
     x, mass = np.asarray(surface.vertices), surface.mass
     rng = np.random.default_rng(0)
@@ -160,15 +160,15 @@ def diffusivity_field():
         experiment = ltl.inverse.Experiment(equation, surface, u0, dt=0.01, solver=ltl.RKL2())
         data = ltl.Observations(*noisy(experiment(dict(log=jnp.asarray(truth)), times).us), times)
 
-        def with_weight(weight, start, experiment=experiment, data=data):
+        def fit_with(weight, start, experiment=experiment, data=data):
             return ltl.fit(
                 experiment, dict(log=np.zeros(len(x))) if start is None else start, data,
-                penalty=lambda p: ltl.inverse.smoothness(surface, p["log"], weight, mass), max_steps=150,
+                penalty=lambda p: ltl.inverse.smoothness(surface, p["log"], weight, mass), max_iterations=150,
             )  # fmt: skip
 
-        weight, found, curve = ltl.inverse.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0, 60.0])
+        weight, fit, curve = ltl.inverse.choose_weight(fit_with, [1000.0, 500.0, 250.0, 125.0, 60.0])
         for half, name in ((x[:, 2] > 0, "upper half"), (x[:, 2] < 0, "lower half")):
-            error = np.linalg.norm((found.params["log"] - truth)[half]) / np.linalg.norm(truth[half])
+            error = np.linalg.norm((fit.params["log"] - truth)[half]) / np.linalg.norm(truth[half])
             print(f"| {title}, {name} | {weight:g} | {curve[-1, 1] / data.values.size:.2f} | {error:.2f} |", flush=True)
     print()
 

@@ -137,7 +137,7 @@ def test_a_source_of_two_bumps_is_found_on_a_rabbit():
         return ltl.fit(
             lambda p: ltl.screened_poisson(surface, p["source"], 1.0),
             dict(source=np.zeros(len(truth))) if start is None else start, data,
-            penalty=lambda p: ltl.inverse.smoothness(surface, p["source"], weight, mass, order=2), max_steps=400,
+            penalty=lambda p: ltl.inverse.smoothness(surface, p["source"], weight, mass, order=2), max_iterations=400,
         )  # fmt: skip
 
     _, found, _ = ltl.inverse.choose_weight(with_weight, [300.0, 100.0, 30.0, 10.0, 3.0, 1.0])
@@ -205,7 +205,7 @@ def test_a_diffusivity_field_is_found_with_tikhonovs_penalty_and_the_discrepancy
     def with_weight(weight, start):
         return ltl.fit(
             experiment, dict(log=np.zeros(len(x))) if start is None else start, data,
-            penalty=lambda p: ltl.inverse.smoothness(small, p["log"], weight, mass), max_steps=150,
+            penalty=lambda p: ltl.inverse.smoothness(small, p["log"], weight, mass), max_iterations=150,
         )  # fmt: skip
 
     weight, found, curve = ltl.inverse.choose_weight(with_weight, [1000.0, 500.0, 250.0, 125.0])
@@ -237,7 +237,7 @@ def test_free_vertices_give_a_stationary_field_a_wanted_value_and_the_mesh_stays
     before = float(warmth(dict(move=0 * x)))
     found = ltl.fit(
         warmth, dict(move=np.zeros(x.shape)), ltl.Observations(1.3 * before, 1e-3 * before),
-        penalty=lambda p: [ltl.inverse.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_steps=80,
+        penalty=lambda p: [ltl.inverse.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_iterations=80,
     )  # fmt: skip
     vertices = np.asarray(x + found.params["move"])
     anew = ltl.Surface.from_mesh(ltl.Mesh(vertices, faces))

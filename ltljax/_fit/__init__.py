@@ -1,11 +1,13 @@
-"""Inverse problems: what a model's parameters, fields, start or shape must be for it to give what was seen."""
+"""Inverse problems: the parameters, fields, initial states or shapes that explain measurements."""
 
 from .agreement import Agreement
-from .fit import Fit, fit
+from .evidence import Evidence
+from .experiment import Experiment
+from .fit import fit
 from .many import ManyFits, explore, fit_many
-from .observations import Experiment, Observations
+from .observations import Observations
 from .penalties import choose_weight, smoothness, total_variation
-from .report import Evidence
+from .result import Fit
 from .sampling import Sampling, observe_at, observe_patches
 from .search import FitError
 from .statistics import PatternStatistics, pattern_statistics

@@ -1,4 +1,4 @@
-"""How a measured value depends on the value of the field: ``scale * field + offset + amount * background``."""
+"""The calibration of data: measured value = ``scale * field + offset + amount * background``."""
 
 from typing import Any
 
@@ -12,12 +12,12 @@ from .unknowns import Bounded, Real, Transform, start_of
 
 
 class Calibration(eqx.Module):
-    """What is known and what is unknown about the scale, the offset and the background of data.
+    """Scale, offset and background of data, each of them known or unknown.
 
     Attributes:
-        scale: factor between the field and the data: known, or the `Transform` of an unknown one.
-        offset: constant that is added, likewise.
-        background: known pattern of which the data hold an unknown amount; None for none.
+        scale: factor between field and data, or the `Transform` of an unknown factor.
+        offset: constant between field and data, or the `Transform` of an unknown constant.
+        background: known pattern of which the data contain an unknown amount; None for none.
         shape: shape of each unknown: () or the number of species.
     """
 
@@ -42,44 +42,47 @@ class Calibration(eqx.Module):
             unknown["background"] = np.zeros(self.shape), Real(), size / strength
         return unknown
 
-    def __call__(self, seen: Array, unknown: dict[str, Array]) -> Array:
-        """The measured values of a field's values, given the unknowns by name."""
+    def __call__(self, field: Array, unknown: dict[str, Array]) -> Array:
+        """The measured values for the values of a field, given the unknowns by name."""
         scale = unknown.get("scale", None if isinstance(self.scale, Transform) else self.scale)
         offset = unknown.get("offset", None if isinstance(self.offset, Transform) else self.offset)
 
         def full(value: Any) -> Array:
-            return jnp.broadcast_to(jnp.asarray(value, seen.dtype), seen.shape)
+            return jnp.broadcast_to(jnp.asarray(value, field.dtype), field.shape)
 
-        measured = seen if scale is None else full(scale) * seen
+        measured = field if scale is None else full(scale) * field
         measured = measured if offset is None else measured + full(offset)
         if self.background is not None and "background" in unknown:
             measured = measured + full(unknown["background"]) * full(self.background)
         return measured
 
-    def guess(self, seen: np.ndarray, values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
-        """The unknowns of least squares for given values of the field; the first guess where that is not admitted.
+    def guess(self, field: np.ndarray, values: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
+        """The least-squares unknowns for given values of the field; the first guess where they are out of range.
 
         Args:
-            seen: values of the field where the data are, in the shape of the data.
-            values: data.
-            mask: which of them were measured.
+            field: values of the field at the places of the data, in the shape of the data.
+            values: the data.
+            mask: which values were measured.
         """
         unknown = self.unknowns(float(np.sqrt(np.mean(values[mask] ** 2))) or 1.0)
         if not unknown:
             return {}
-        terms = {"scale": seen, "offset": np.ones_like(seen)}
+        terms = {"scale": field, "offset": np.ones_like(field)}
         if self.background is not None:
-            terms["background"] = np.broadcast_to(np.asarray(self.background, seen.dtype), seen.shape)
-        given = {name: getattr(self, name) for name in ("scale", "offset") if name not in unknown}
-        known = {name: np.broadcast_to(np.asarray(value), self.shape) for name, value in given.items()}
+            terms["background"] = np.broadcast_to(np.asarray(self.background, field.dtype), field.shape)
+        known = {
+            name: np.broadcast_to(np.asarray(getattr(self, name)), self.shape)
+            for name in ("scale", "offset")
+            if name not in unknown
+        }
         solved = {name: start.copy() for name, (start, _, _) in unknown.items()}
         for index in np.ndindex(self.shape):
             column = (..., *index)
             rows = mask[column]
             fixed = [factor[index] * terms[name][column][rows] for name, factor in known.items()]
-            rest = values[column][rows] - sum(fixed)
+            remainder = values[column][rows] - sum(fixed)
             columns = np.stack([terms[name][column][rows] for name in unknown], axis=-1)
-            for name, value in zip(unknown, np.linalg.lstsq(columns, rest)[0], strict=True):
+            for name, value in zip(unknown, np.linalg.lstsq(columns, remainder)[0], strict=True):
                 if unknown[name][1].admits(value):
                     solved[name][index] = value
         return solved
@@ -89,14 +92,14 @@ def calibration(scale: Any, offset: Any, background: Any, shape: tuple[int, ...]
     """The calibration that a user describes.
 
     Args:
-        scale: a number, one for each species, or a transform; None for 1.
-        offset: likewise; None for 0.
-        background: an array that broadcasts to the data; None for none.
+        scale: number, one number for each species, or transform; None for 1.
+        offset: number, one number for each species, or transform; None for 0.
+        background: array that broadcasts to the data; None for none.
         shape: shape of each unknown: () or the number of species.
         data: shape of the data.
 
     Raises:
-        ValueError: a number is not finite, a scale is zero, or a shape does not fit.
+        ValueError: a number is not finite, a scale is zero, or a shape does not match.
     """
     chosen: dict[str, Any] = {}
     for name, value, default in (("scale", scale, 1.0), ("offset", offset, 0.0)):
@@ -125,7 +128,7 @@ def calibration(scale: Any, offset: Any, background: Any, shape: tuple[int, ...]
 
 
 def _inside(transform: Transform, default: float) -> float:
-    """The default; the middle of the range where that is bounded and does not hold it."""
+    """The default, or the middle of a bounded range that does not contain the default."""
     if isinstance(transform, Bounded) and not transform.admits(np.asarray(default)):
         return 0.5 * (transform.low + transform.high)
     return default

@@ -1,4 +1,4 @@
-"""An interrupted fit on disk: its unknowns, and the checks that only the same fit goes on from them."""
+"""An interrupted fit on disk: its unknowns, and the checks that only the same fit continues from them."""
 
 import dataclasses
 import io
@@ -15,18 +15,35 @@ from .._solve.restart import RestartError
 from .observations import Observations
 from .unknowns import Unknowns
 
-# Residuals that differ by less than this share, of themselves and of the data, are those of the same model.
+# Residuals belong to the same model if their norms differ by less than this share of the norms of residuals and data.
 _SAME = 1e-4
-_ANEW = "Fit without resume, or give another checkpoint."
+_CURE = "Fit without resume, or give another checkpoint."
+
+
+@dataclasses.dataclass(frozen=True)
+class Interrupted:
+    """The content of a checkpoint.
+
+    Attributes:
+        space: unknowns with the scales of the interrupted fit.
+        z: vector of the unknowns.
+        loss: loss at ``z``.
+        spread: spread of the misfit that the loss was computed with.
+    """
+
+    space: Unknowns
+    z: Array
+    loss: float
+    spread: np.ndarray
 
 
 class Checkpoint:
-    """The unknowns on disk, whole or not at all, and what a fit must be to go on from them.
+    """The file that keeps the unknowns of a fit. It is written completely or not at all.
 
     Args:
-        path: the file.
-        space: the unknowns.
-        data: what is fitted.
+        path: file.
+        space: unknowns.
+        data: fitted data.
     """
 
     def __init__(self, path: Path, space: Unknowns, data: Observations):
@@ -35,7 +52,7 @@ class Checkpoint:
         self.fit = {"data": fingerprint(data), "ranges of parameters": fingerprint(space.transforms)}
 
     def keep(self, z: Array, loss: float, spread: np.ndarray) -> None:
-        """Write a step: the unknowns, the loss there, and the spread of the misfit that it was computed with."""
+        """Write the unknowns, the loss there, and the spread of the misfit that it was computed with."""
         scales = np.array([float(scale) for scale in self.space.scales])
         content = io.BytesIO()
         np.savez(
@@ -45,34 +62,41 @@ class Checkpoint:
         with self.folder.locked(waits=True):
             self.folder.write(self.path.name, content.getvalue())
 
-    def read(self) -> tuple[Unknowns, Array, float, np.ndarray]:
-        """The unknowns with the scales they were left with, their vector, the loss there, and the spread."""
+    def read(self) -> Interrupted:
+        """The content of the file; its scales become those of later checkpoints.
+
+        Raises:
+            RestartError: the file is damaged, or belongs to a fit of other data or parameters.
+        """
         try:
             with np.load(self.path, allow_pickle=False) as file:
-                kept = {name: file[name] for name in ("unknowns", "names", "scales", "loss", "spread", "fit")}
-        # NumPy meets damaged files with any of these.
+                content = {name: file[name] for name in ("unknowns", "names", "scales", "loss", "spread", "fit")}
+        # NumPy raises any of these on a damaged file.
         except (ValueError, KeyError, OSError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile):
-            raise RestartError(f"{self.path} is damaged, or no file of a fit. {_ANEW}") from None
-        if tuple(kept["names"]) != self.space.names:
+            raise RestartError(f"{self.path} is damaged, or not the file of a fit. {_CURE}") from None
+        if tuple(content["names"]) != self.space.names:
             raise RestartError(
-                f"{self.path} holds the parameters of another fit: {', '.join(kept['names'][:8])}; expected "
-                f"{', '.join(self.space.names[:8])}. {_ANEW}"
+                f"{self.path} holds the parameters of another fit: {', '.join(content['names'][:8])}; expected "
+                f"{', '.join(self.space.names[:8])}. {_CURE}"
             )
-        for (what, mine), theirs in zip(self.fit.items(), kept["fit"], strict=True):
-            if mine != theirs:
-                raise RestartError(f"{self.path} holds another fit: its {what} differ. {_ANEW}")
-        scales = tuple(jnp.asarray(k, s.dtype) for k, s in zip(kept["scales"], self.space.scales, strict=True))
-        space = dataclasses.replace(self.space, scales=scales)
-        self.space = space
-        return space, jnp.asarray(kept["unknowns"], scales[0].dtype), float(kept["loss"]), kept["spread"]
+        for (name, own), other in zip(self.fit.items(), content["fit"], strict=True):
+            if own != other:
+                raise RestartError(f"{self.path} holds another fit: its {name} differ. {_CURE}")
+        scales = tuple(
+            jnp.asarray(value, scale.dtype) for value, scale in zip(content["scales"], self.space.scales, strict=True)
+        )
+        self.space = dataclasses.replace(self.space, scales=scales)
+        z = jnp.asarray(content["unknowns"], scales[0].dtype)
+        return Interrupted(self.space, z, float(content["loss"]), content["spread"])
 
-    def refuse_other(self, loss: float, left: float, spread: np.ndarray) -> None:
-        """Raise where the model gives another loss than the one that was left."""
-        here, there = np.sqrt(2 * loss), np.sqrt(2 * left)
+    def refuse_other(self, loss: float, loss_in_file: float, spread: np.ndarray) -> None:
+        """Raise `RestartError` if the model gives another loss than the one in the file."""
+        norm, norm_in_file = np.sqrt(2 * loss), np.sqrt(2 * loss_in_file)
         values = np.asarray(self.data.values, np.float64)
         noise = spread * (1.0 if self.data.noise is None else np.asarray(self.data.noise, np.float64))
-        size = np.linalg.norm(np.sqrt(values) if self.data.is_count else values / noise)
-        if not abs(here - there) <= _SAME * (there + size):
+        data_norm = np.linalg.norm(np.sqrt(values) if self.data.is_count else values / noise)
+        if not abs(norm - norm_in_file) <= _SAME * (norm_in_file + data_norm):
             raise RestartError(
-                f"{self.path} holds another fit: its loss was {left:.6g} where this model's is {loss:.6g}. {_ANEW}"
+                f"{self.path} holds another fit: its loss was {loss_in_file:.6g} and the loss of this model is "
+                f"{loss:.6g}. {_CURE}"
             )

@@ -1,8 +1,8 @@
-"""Loss functions: how much a residual counts where some of the data may be wrong.
+"""Loss functions, which limit the influence of outliers.
 
-A loss is written as SciPy writes it: a function rho of the squared residual z, in units of the noise. A fit minimises
-``1/2 sum(c^2 rho(r^2 / c^2))``; rho(z) = z is least squares, and a rho that grows more slowly limits what an outlier
-can do. Least-squares methods see the signed root of each term in place of the residual, so they minimise the same sum.
+As in SciPy, a loss is a function rho of the squared residual z in units of the noise. A fit minimises
+``1/2 sum(c^2 rho(r^2 / c^2))``. rho(z) = z is least squares, and a rho that grows more slowly limits the influence of
+outliers. Least-squares methods receive the signed root of each term as its residual, so they minimise the same sum.
 """
 
 from collections.abc import Callable
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# A loss is taken to be proportional to the squared residual z below this power of the rounding: formulas such as
-# sqrt(1 + z) - 1 lose their digits there.
+# Below this power of the machine epsilon, a loss is taken to be proportional to the squared residual z, because
+# formulas such as sqrt(1 + z) - 1 lose their digits there.
 _SMALL = 0.45
 
 
@@ -31,8 +31,8 @@ def _soft_l1(z: Array) -> Array:
     return 2 * z / (1 + jnp.sqrt(1 + z))
 
 
-# Each with the scale c at which it loses 5 % of the efficiency of least squares if the noise is normal after all
-# (Holland and Welsch 1977, Robust regression using iteratively reweighted least-squares; the third by quadrature).
+# Each loss with the scale c at which it has 95 % of the efficiency of least squares under normal noise
+# (Holland and Welsch 1977, Robust regression using iteratively reweighted least-squares; soft_l1 by quadrature).
 _LOSSES: dict[str, tuple[Callable[[Array], Array], float]] = {
     "linear": (_linear, 1.0),
     "huber": (_huber, 1.345),
@@ -56,11 +56,11 @@ class Loss(eqx.Module):
 
     @property
     def is_robust(self) -> bool:
-        """Whether it is another loss than that of least squares."""
+        """Whether the loss differs from least squares."""
         return self.rho is not _linear
 
     def root(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The number of the residual's sign whose squared half is the loss."""
+        """The number with the sign of the residual, half of whose square is the loss."""
         if not self.is_robust:
             return r
         z = (r / self.scale) ** 2
@@ -68,17 +68,17 @@ class Loss(eqx.Module):
         return r * jnp.sqrt(self.rho(safe) / safe)
 
     def influence(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First and second derivative of the loss with respect to each residual (N,)."""
+        """First and second derivatives (N,) of the loss with respect to each residual."""
         residuals = jnp.asarray(r)
         first = jax.grad(lambda r: 0.5 * self.root(r) ** 2)
         return np.asarray(jax.vmap(first)(residuals)), np.asarray(jax.vmap(jax.grad(first))(residuals))
 
 
 def as_loss(loss: Any) -> Loss:
-    """The loss of a name or a function.
+    """The loss with a name, or of a function rho.
 
     Raises:
-        ValueError: there is no such loss, or the function cannot be one: it is not finite, not zero at zero, or falls.
+        ValueError: there is no loss of this name, or the function is not finite, not zero at zero, or decreases.
     """
     if isinstance(loss, Loss):
         return loss
@@ -94,13 +94,13 @@ def as_loss(loss: Any) -> Loss:
     z = jnp.asarray(np.concatenate([[0.0], np.logspace(-4, 4, 33)]))
     try:
         values = np.asarray(loss(z), np.float64)
-    except Exception as error:  # of a function by the user, which may raise any
+    except Exception as error:  # a user's function may raise any exception
         raise ValueError(f"The loss fails on an array of squared residuals: {type(error).__name__}: {error}") from error
     if values.shape != z.shape or not np.isfinite(values).all():
         raise ValueError("Expected a loss that returns one finite number for each squared residual from 0 to 10,000.")
     if abs(values[0]) > 1e-6 * abs(values[-1]) or values[1] <= 0 or (np.diff(values) < -1e-6 * values.max()).any():
         raise ValueError(
-            f"Expected a loss rho(z) with rho(0) = 0 that rises with z, found rho(0) = {values[0]:.3g}, rho(1e-4) = "
-            f"{values[1]:.3g} and rho(1e4) = {values[-1]:.3g}."
+            f"Expected a loss rho(z) with rho(0) = 0 that increases with z, found rho(0) = {values[0]:.3g}, "
+            f"rho(1e-4) = {values[1]:.3g} and rho(1e4) = {values[-1]:.3g}."
         )
     return Loss(getattr(loss, "__name__", "loss"), loss, 1.0)  # type: ignore (its values were checked above)

@@ -1,4 +1,4 @@
-"""A fit ready to run: residuals of a vector of unknowns, their derivatives, and the method that steps on them."""
+"""A fit ready to run: the residuals as a function of the unknowns, their derivatives, and the method."""
 
 import collections
 import dataclasses
@@ -17,15 +17,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._solve.fingerprint import fingerprint, read_from_modules
+from .experiment import Experiment
 from .methods import MANY, method_of
-from .observations import Experiment, Observations
+from .observations import Observations
 from .unknowns import Unknowns, unknowns
 
-# The first damping, relative to the Jacobian's norm: after Marquardt (1963), who begins with a hundredth of its square.
+# Initial damping, relative to the norm of the Jacobian. Marquardt (1963) begins with a hundredth of its square.
 _DAMPING = 0.1
 
-# Traced programs kept for a second fit of the same model.
-_KEPT = 8
+# Largest number of traced programs that are kept for another fit of the same model.
+_MAX_TRACED = 8
 
 Model = Experiment | Callable[..., Any]
 Residuals = Callable[[Any], Any]
@@ -35,11 +36,11 @@ class FitResiduals(eqx.Module):
     """The residuals of a vector of unknowns: misfit to the data, then penalties.
 
     Attributes:
-        model: model.
-        data: data.
-        space: unknowns.
+        model: the model.
+        data: the data.
+        space: the unknowns.
         penalty: function from parameters to residuals that are added to those of the data.
-        adjoint: adjoint that makes time stepping differentiable in the mode needed.
+        adjoint: adjoint that makes time stepping differentiable in the required mode.
         spread: standard deviation of the misfit in units of the noise.
     """
 
@@ -51,15 +52,16 @@ class FitResiduals(eqx.Module):
     spread: Array
 
     def predicted(self, z: Array) -> Any:
-        """What the model gives."""
+        """The output of the model."""
         params = self.space.params(z)
-        assert self.model is not None, "what differs from fit to fit has no model"
+        assert self.model is not None, "the arrays of a Program have no model"
         if isinstance(self.model, Experiment):
             return self.model(params, self.data.times, self.adjoint)
         return self.model(params) if self.adjoint is None else self.model(params, adjoint=self.adjoint)
 
     def both(self, z: Array) -> tuple[Array, Array]:
-        """Residuals (M + P,) whose squared halves sum to the loss, infinite where the model fails; the misfit (M,)."""
+        """Residuals (M + P,), half of whose sum of squares is the loss, all infinite if the model fails; and the misfit
+        (M,)."""
         misfit = self.data.misfit(self.predicted(z), self.space.calibration(z), self.spread)
         residuals = self.data.loss.root(misfit)
         if self.penalty is not None:
@@ -73,18 +75,18 @@ class FitResiduals(eqx.Module):
 
 
 class Program(eqx.Module):
-    """The residuals as a traced program, which a second fit of the same model finds compiled.
+    """The residuals as a traced program, which is compiled once for all fits of the same model.
 
     Attributes:
-        run: program, from the arrays and a vector of unknowns to residuals and misfit.
-        arrays: `FitResiduals` reduced to its arrays.
+        run: function from the arrays and a vector of unknowns to residuals and misfit.
+        arrays: the arrays of `FitResiduals`.
     """
 
     run: Callable[[Any, Array], tuple[Array, Array]]
     arrays: Any
 
     def both(self, z: Array) -> tuple[Array, Array]:
-        """As of `FitResiduals`."""
+        """Residuals and misfit, as of `FitResiduals`."""
         return self.run(self.arrays, z)
 
     def __call__(self, z: Array) -> Array:
@@ -97,7 +99,7 @@ class Program(eqx.Module):
         return len(self.arrays.space.names)
 
     def with_spread(self, spread: Array) -> "Program":
-        """The same with another spread of the misfit."""
+        """The same program with another spread of the misfit."""
         return eqx.tree_at(lambda program: program.arrays.spread, self, spread)
 
 
@@ -105,7 +107,7 @@ AnyResiduals = FitResiduals | Program
 
 
 def _jacobian(residuals: AnyResiduals, z: Array, reverse: bool) -> tuple[tuple[Array, Array], Array]:
-    """Residuals and misfit, and the residuals' Jacobian (M + P, n), from one run of the model and its derivatives."""
+    """Residuals and misfit, and the Jacobian (M + P, n) of the residuals, from one run of the model."""
     if reverse:
         value, pull, misfit = jax.vjp(residuals.both, z, has_aux=True)
         return (value, misfit), jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size, dtype=value.dtype))
@@ -116,7 +118,7 @@ def _jacobian(residuals: AnyResiduals, z: Array, reverse: bool) -> tuple[tuple[A
 
 @eqx.filter_custom_jvp
 def _linearised(z, residuals, reverse):
-    """Residuals whose derivative is a Jacobian that is formed once, beside them: one run of the model for a step."""
+    """Residuals whose Jacobian is computed together with them, so that an iteration needs one run of the model."""
     del reverse
     return residuals(z)
 
@@ -129,7 +131,7 @@ def _(primals, tangents):
 
 
 class _LeastSquares(eqx.Module):
-    """What optimistix's least-squares solvers see."""
+    """The scaled residuals, as the least-squares solvers of optimistix expect them."""
 
     residuals: AnyResiduals
     scale: Array
@@ -141,7 +143,7 @@ class _LeastSquares(eqx.Module):
 
 
 class _Loss(eqx.Module):
-    """What optimistix's minimisers see."""
+    """The scaled loss, as the minimisers of optimistix expect it."""
 
     residuals: AnyResiduals
     scale: Array
@@ -155,11 +157,11 @@ class Problem(eqx.Module):
     """A fit ready to run.
 
     Attributes:
-        residuals: residuals of a vector of unknowns.
-        program: the same, traced.
-        solver: optimiser.
+        residuals: residuals as a function of the unknowns.
+        program: the same residuals as a traced program.
+        solver: solver of optimistix.
         reverse: whether derivatives are taken in reverse mode.
-        method: method and kind of derivatives, in words.
+        method: method and mode of differentiation, in words.
     """
 
     residuals: FitResiduals
@@ -175,34 +177,33 @@ class Problem(eqx.Module):
 
     @property
     def data(self) -> Observations:
-        """What is fitted."""
+        """The fitted data."""
         return self.residuals.data
 
     @property
     def model(self) -> Model:
-        """What is fitted to it."""
+        """The model."""
         assert self.residuals.model is not None
         return self.residuals.model
 
     @property
     def is_least_squares(self) -> bool:
-        """Whether the method sees residuals, not their loss alone."""
+        """Whether the method uses the residuals, and not only the loss."""
         return isinstance(self.solver, optx.AbstractLeastSquaresSolver)
 
     def function(self, residuals: AnyResiduals, z: Array) -> tuple[Any, tuple[Array, Array]]:
-        """What the solver steps on, scaled so that its first damping, 1, suits the problem; residuals and misfit."""
+        """The function that the solver minimises, scaled so that an initial damping of 1 suits it; residuals and misfit
+        at ``z``."""
         if not self.is_least_squares:
-            # A first step along the gradient then has the length of one.
+            # With this scale, the first step along the gradient has length 1.
             slope, values = _gradient(residuals, z)
             return _Loss(residuals, 1 / jnp.sqrt(_or_one(jnp.linalg.norm(slope)))), values
         values, jacobian = jacobian_of(residuals, z, self.reverse)
         scale = 1 / _or_one(_DAMPING * jnp.linalg.norm(jacobian))
         return _LeastSquares(residuals, scale, self.reverse), values
 
-    def profile(
-        self, residuals: Program, z0: Array, name: str, values: np.ndarray, max_steps: int
-    ) -> np.ndarray:  # fmt: skip
-        """(P,) the least losses with one parameter held at each of some values, from the optimum outwards."""
+    def profile(self, residuals: Program, z0: Array, name: str, values: np.ndarray, max_iterations: int) -> np.ndarray:
+        """(P,) least losses with one parameter held at each of some values."""
         if name not in self.space.names:
             raise ValueError(f"There is no parameter {name!r}; there are {', '.join(self.space.names)}.")
         if not self.is_least_squares:
@@ -217,29 +218,29 @@ class Problem(eqx.Module):
             return np.array([0.5 * float(jnp.sum(r**2)) for r in at])
         losses = np.empty(len(values))
         rest = jnp.delete(z0, index)
-        # Outwards from the optimum, each from its neighbour's.
+        # From the optimum outwards, so that each search begins at the solution of the nearest value.
         order = np.argsort(np.abs(values - float(flat[index])))
-        known: dict[int, Array] = {}
+        solutions: dict[int, Array] = {}
         for k in order:
             held = self.space.free(rebuild(flat.at[index].set(values[k])))[index]
             if not np.isfinite(held):
                 raise ValueError(f"{name} = {values[k]:g} is outside the range of the parameter.")
-            near = min(known, key=lambda j: abs(values[j] - values[k]), default=None)
-            z = rest if near is None else known[near]
-            solution = _profiled(residuals, solver, scale, z, held, index, self.reverse, max_steps)
-            known[int(k)] = solution.value
+            nearest = min(solutions, key=lambda j: abs(values[j] - values[k]), default=None)
+            z = rest if nearest is None else solutions[nearest]
+            solution = _profiled(residuals, solver, scale, z, held, index, self.reverse, max_iterations)
+            solutions[int(k)] = solution.value
             losses[k] = 0.5 * float(jnp.sum(solution.aux**2))
         return losses
 
 
 def _or_one(norm: Array) -> Array:
-    """A norm to scale by; one of a problem without slope."""
+    """The norm, or 1 where it is zero."""
     return jnp.where(norm == 0, 1.0, norm)
 
 
 @eqx.filter_jit
 def jacobian_of(residuals, z, reverse):
-    """Residuals and misfit, and the residuals' Jacobian, compiled once for a problem."""
+    """Residuals and misfit, and the Jacobian of the residuals, compiled once for a problem."""
     return _jacobian(residuals, z, reverse)
 
 
@@ -259,21 +260,25 @@ def _gradient(residuals, z):
 
 
 @eqx.filter_jit
-def _profiled(residuals, solver, scale, rest, held, index, reverse, max_steps):
+def _profiled(residuals, solver, scale, rest, held, index, reverse, max_iterations):
     def scaled(rest, args):
         del args
         z = jnp.concatenate([rest[:index], held[None], rest[index:]])
         value = _linearised(z, residuals, reverse)
         return scale * value, value
 
-    return optx.least_squares(scaled, solver, rest, has_aux=True, throw=False, max_steps=max_steps)
+    return optx.least_squares(scaled, solver, rest, has_aux=True, throw=False, max_steps=max_iterations)
 
 
 def prepare(
     model: Model, space: Unknowns, data: Observations, penalty: Residuals | None, method: Any, z: Array,
     rtol: float, atol: float,
 ) -> Problem:  # fmt: skip
-    """The problem, its method and derivatives chosen, its shapes checked."""
+    """The problem, with its method and mode of differentiation chosen and its shapes checked.
+
+    Raises:
+        ValueError: model and data do not match, there are fewer values than unknowns, or the method cannot be used.
+    """
     spread = jnp.ones(data.spread_shape, z.dtype)
     plain = FitResiduals(model, data, space, penalty, forward_adjoint(model), spread)
     solver, name = method_of(method, z.size, rtol, atol, space.reach)
@@ -286,14 +291,14 @@ def prepare(
     if key is not None:
         with _LOCK:
             _TRACED[key] = traced
-            while len(_TRACED) > _KEPT:
+            while len(_TRACED) > _MAX_TRACED:
                 _TRACED.popitem(last=False)
     run, adjoint, reverse, num_residuals, how = traced
     num_values = num_residuals - data.values.size + data.num_values
     if num_values < z.size:
         raise ValueError(
-            f"Expected at least as many values as unknowns, found {num_values} for {z.size}. Observe more, fit "
-            "fewer parameters, or add what is known as penalty= (ltl.inverse.smoothness, say)."
+            f"Expected at least as many values as unknowns, found {num_values} values for {z.size} unknowns. Observe "
+            "more, fit fewer parameters, or add prior knowledge as penalty= (such as ltl.inverse.smoothness)."
         )
     residuals = dataclasses.replace(plain, adjoint=adjoint)
     program = Program(run, eqx.filter(_without_model(plain), is_on_device))
@@ -301,12 +306,12 @@ def prepare(
 
 
 def is_on_device(leaf: Any) -> bool:
-    """Whether a leaf is an argument of the program; NumPy arrays, such as times, belong to the program itself."""
+    """Whether a leaf is an argument of the program. NumPy arrays, such as times, are constants of it."""
     return isinstance(leaf, jax.Array)
 
 
 def _without_model(residuals: FitResiduals) -> FitResiduals:
-    """What differs from fit to fit of the same model: data, unknowns and spread."""
+    """The parts that differ between fits of the same model: data, unknowns and spread."""
     return dataclasses.replace(residuals, model=None, penalty=None, adjoint=None)
 
 
@@ -315,25 +320,25 @@ _TRACED: collections.OrderedDict[Hashable, tuple[Any, Any, bool, int, str]] = co
 
 
 def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any, Any, bool, int, str]:
-    """The program of the residuals, its adjoint, whether derivatives are in reverse mode, the number of residuals, and
-    how derivatives are taken, in words.
+    """The traced residuals, their adjoint, whether derivatives are taken in reverse mode, the number of residuals, and
+    the mode of differentiation in words.
 
-    The model's arrays are known while it is traced, since what is measured of a surface on the host is only known of
-    such; then they become arguments, so that none is a constant of the program.
+    The arrays of the model are concrete during tracing, because quantities of a surface that are computed on the host
+    need that. They become arguments afterwards, so that the program holds no large constants.
     """
     takes_adjoint = plain.adjoint is not None
     plain.data.check(eqx.filter_eval_shape(lambda z: plain.predicted(z), z))
     num_residuals = eqx.filter_eval_shape(lambda z: plain(z), z).size
     reverse, how = True, f"gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}"
     if is_least_squares:
-        reverse, how = False, f"its Jacobian in forward mode, {z.size} tangents beside each run"
-        if not _goes_forward(plain, z):
+        reverse, how = False, f"Jacobian in forward mode with {z.size} tangents per run"
+        if not _has_forward_mode(plain, z):
             if num_residuals > MANY:
                 raise ValueError(
-                    "The model cannot be differentiated in forward mode. Let it take adjoint= and hand it to "
-                    "ltl.solve, or choose a method that needs gradients alone: method=optx.BFGS(rtol, atol)."
+                    "The model cannot be differentiated in forward mode. Let it take adjoint= and pass it on to "
+                    "ltl.solve, or choose a method that needs only gradients: method=optx.BFGS(rtol, atol)."
                 )
-            reverse, how = True, f"its Jacobian in reverse mode, {num_residuals} rows"
+            reverse, how = True, f"Jacobian in reverse mode with {num_residuals} rows"
     else:
         plain = dataclasses.replace(plain, adjoint=None)
     arrays, rest = eqx.partition(_without_model(plain), is_on_device)
@@ -345,11 +350,11 @@ def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any,
 
 
 def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
-    """What the program of the residuals depends on beside the numbers of data, unknowns and spread; None where that
-    cannot be told.
+    """A key of everything that the traced residuals depend on except the values of data, unknowns and spread; None if
+    there is no such key.
 
-    Model and penalty count by their arrays, by the source of their functions, and by the values that these read from
-    the functions and modules around them, so that a changed value is seen.
+    Model and penalty enter by their arrays, by the source of their functions, and by the values that these functions
+    read from enclosing functions and modules, so that a changed value gives another key.
     """
     arrays, rest = eqx.partition(_without_model(plain), is_on_device)
     shapes = tuple((leaf.shape, str(leaf.dtype), bool(leaf.weak_type)) for leaf in jax.tree.leaves(arrays))
@@ -366,13 +371,13 @@ def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
 def first_unknowns(
     start: Any, transforms: Any, data: Observations, size: float | None = None
 ) -> tuple[Unknowns, Array]:
-    """The unknowns of a fit, those of the measurement among them, and their first vector.
+    """The unknowns of a fit, including those of the measurement, and their vector at the start.
 
     Args:
         start: first guess of the parameters.
         transforms: ranges of the parameters, as of `fit`.
         data: data.
-        size: typical size of the data, where it is not that of ``data``.
+        size: typical size of the data; by default that of ``data``.
     """
     calibration = data.calibration.unknowns(data.typical_size if size is None else size)
     space = unknowns(start, transforms, calibration)
@@ -380,20 +385,21 @@ def first_unknowns(
 
 
 def forward_adjoint(model: Model) -> diffrax.AbstractAdjoint | None:
-    """What makes time stepping differentiable in forward mode, for models that take an adjoint."""
+    """The adjoint that makes time stepping differentiable in forward mode; None if the model takes no adjoint."""
     takes_adjoint = isinstance(model, Experiment) or "adjoint" in inspect.signature(model).parameters
     return diffrax.ForwardMode() if takes_adjoint else None
 
 
 def steps_adaptively(model: Model) -> bool:
-    """Whether a model may take adaptive steps, as far as can be seen from outside."""
+    """Whether a model may take adaptive time steps, as far as its type or signature tells."""
     return model.dt is None if isinstance(model, Experiment) else forward_adjoint(model) is not None
 
 
-def _goes_forward(residuals: FitResiduals, z: Array) -> bool:
+def _has_forward_mode(residuals: FitResiduals, z: Array) -> bool:
+    """Whether the residuals can be differentiated in forward mode."""
     try:
-        # All tangents, not one: JAX notices a function that has reverse mode alone when it maps over tangents.
+        # JAX raises for functions with a reverse mode only when it maps over tangents, so all of them are pushed.
         jax.eval_shape(lambda z: _jacobian(residuals, z, False), z)
-    except TypeError:  # what JAX says of functions that define reverse mode alone
+    except TypeError:
         return False
     return True

@@ -1,4 +1,4 @@
-"""Where data sample a field: at points in space, over patches, or by any weighted sums of its values at vertices."""
+"""Sampling of a field: at points in space, over patches, or by any weighted sums of its values at vertices."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,8 +19,8 @@ class Sampling(eqx.Module):
     """Weighted sums of a field's values at vertices, one for each measurement.
 
     Attributes:
-        vertices: vertices that each measurement reads, padded with vertex 0.
-        weights: weights of their values, padded with zeros.
+        vertices: vertices of each measurement, padded with vertex 0.
+        weights: weights of the values at these vertices, padded with zeros.
         num_vertices: number of vertices of the surface.
     """
 
@@ -32,8 +32,8 @@ class Sampling(eqx.Module):
         """The measurements of a field.
 
         Args:
-            u: field or series of fields, with the vertices along one of the axes, where the result has measurements.
-            axis: axis of the vertices.
+            u: field or series of fields with one axis of vertices.
+            axis: axis of the vertices, which becomes the axis of the measurements.
         """
         u = jnp.moveaxis(jnp.asarray(u), axis, 0)
         terms = jnp.take(u, self.vertices, axis=0)
@@ -45,16 +45,16 @@ class Sampling(eqx.Module):
 def observe_at(surface: Surface, points: Float[AnyArray, "M 3"], within: float | None = None) -> Sampling:
     """Measurements at points in space: the field at the closest point of the surface, interpolated over its triangle.
 
-    Linear interpolation has an error of second order in the mesh size. The vertices of another mesh of the same shape
-    are points too, so data that are given on that mesh need nothing else.
+    Linear interpolation has an error of second order in the mesh size. Data on another mesh of the same shape can be
+    given at the vertices of that mesh.
 
     Args:
         surface: surface that carries the field.
         points: points in the coordinates of the mesh.
-        within: largest distance from the surface that is accepted; the mesh size by default.
+        within: largest accepted distance from the surface; by default the mesh size.
 
     Raises:
-        ValueError: a point is farther away, or not finite.
+        ValueError: a point is farther from the surface, or not finite.
 
     Example:
         >>> import numpy as np
@@ -72,12 +72,12 @@ def observe_at(surface: Surface, points: Float[AnyArray, "M 3"], within: float |
     corners = np.asarray(surface.vertices, np.float64)[np.asarray(surface.faces)] + surface.centre
     faces, weights, distances = _closest(corners, points)
     reach = float(surface.mesh_size) if within is None else float(within)
-    far = int(np.argmax(distances))
-    if distances[far] > reach:
+    farthest = int(np.argmax(distances))
+    if distances[farthest] > reach:
         raise ValueError(
-            f"Point {far} at {_in_words(points[far])} is {distances[far]:.4g} from the surface, and "
+            f"Point {farthest} at {_formatted(points[farthest])} is {distances[farthest]:.4g} from the surface, and "
             f"{int(np.sum(distances > reach))} of {len(points)} points are farther away than {reach:.4g}. Check the "
-            "units and the place of the points, leave them out, or allow the distance with within=."
+            "units and the position of the points, leave out those that are far, or allow the distance with within=."
         )
     return Sampling(np.asarray(surface.faces)[faces], jnp.asarray(weights, surface.dtype), surface.num_vertices)
 
@@ -88,11 +88,11 @@ def observe_patches(surface: Surface, patches: Sequence[Any] | AnyArray) -> Samp
 
     Args:
         surface: surface that carries the field.
-        patches: vertices of each patch, as indices or masks (V,); or for each vertex the number of its patch (V,),
-            counted from 0, and -1 where it belongs to none.
+        patches: vertices of each patch, as indices or masks (V,); or the number of the patch of each vertex (V,),
+            counted from 0, and -1 for vertices of no patch.
 
     Raises:
-        ValueError: a patch has no vertices, or a vertex that the surface does not have.
+        ValueError: a patch has no vertices, or a vertex is not one of the surface.
 
     Example:
         >>> import numpy as np
@@ -112,8 +112,8 @@ def observe_patches(surface: Surface, patches: Sequence[Any] | AnyArray) -> Samp
         members = [np.asarray(patch) for patch in patches]
         for number, patch in enumerate(members):
             is_mask = patch.dtype == bool and patch.shape == (size,)
-            is_list = np.issubdtype(patch.dtype, np.integer) and patch.ndim == 1
-            if patch.size and not is_mask and not is_list:
+            is_indices = np.issubdtype(patch.dtype, np.integer) and patch.ndim == 1
+            if patch.size and not is_mask and not is_indices:
                 raise ValueError(f"Expected patch {number} as vertices (N,) or a mask ({size},), found {patch!r}.")
         members = [np.flatnonzero(patch) if patch.dtype == bool else np.unique(patch) for patch in members]
     if not members:
@@ -131,10 +131,10 @@ def observe_patches(surface: Surface, patches: Sequence[Any] | AnyArray) -> Samp
 
 
 def as_sampling(operator: Any, dtype: Any = None) -> Sampling:
-    """The measurements of a linear operator: a `Sampling`, or a matrix (M, V), dense or sparse.
+    """The `Sampling` of an operator: a `Sampling`, or a matrix (M, V), dense or sparse.
 
     Raises:
-        ValueError: the operator is none of these, has entries that are not finite, or a row without entries.
+        ValueError: the operator is not a matrix, an entry is not finite, or a row has no entries.
     """
     if isinstance(operator, Sampling):
         return operator
@@ -156,26 +156,26 @@ def as_sampling(operator: Any, dtype: Any = None) -> Sampling:
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The triangle (M,) closest to each point, the barycentric weights (M, 3) of its closest point, the distance."""
+    """The triangle (M,) closest to each point, the barycentric weights (M, 3) of that point, and the distance (M,)."""
     from trimesh.triangles import closest_point, points_to_barycentric
 
     centroids = corners.mean(axis=1)
     radius = np.linalg.norm(corners - centroids[:, None], axis=2).max()
     tree = KDTree(centroids)
-    # The closest triangle is no farther than the closest corner, so its centroid is at most a radius beyond that.
+    # The closest triangle is at most as far as the closest corner, and its centroid at most a radius farther.
     reach = KDTree(corners.reshape(-1, 3)).query(points)[0] + radius * (1 + 1e-9)
     faces, weights, distances = [], [], []
-    for point, near in zip(points, tree.query_ball_point(points, reach), strict=True):
-        near = np.array(near)
-        places = closest_point(corners[near], np.broadcast_to(point, (len(near), 3)))
-        gaps = np.linalg.norm(places - point, axis=1)
-        best = int(np.argmin(gaps))
-        faces.append(near[best])
-        weights.append(points_to_barycentric(corners[near[best]][None], places[best][None])[0])
-        distances.append(gaps[best])
+    for point, nearby in zip(points, tree.query_ball_point(points, reach), strict=True):
+        candidates = np.array(nearby)
+        feet = closest_point(corners[candidates], np.broadcast_to(point, (len(candidates), 3)))
+        lengths = np.linalg.norm(feet - point, axis=1)
+        best = int(np.argmin(lengths))
+        faces.append(candidates[best])
+        weights.append(points_to_barycentric(corners[candidates[best]][None], feet[best][None])[0])
+        distances.append(lengths[best])
     weights = np.clip(np.array(weights), 0, 1)
     return np.array(faces), weights / weights.sum(axis=1, keepdims=True), np.array(distances)
 
 
-def _in_words(point: np.ndarray) -> str:
+def _formatted(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"

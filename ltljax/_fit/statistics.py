@@ -1,4 +1,4 @@
-"""What a pattern is like, whatever its phase: wavelength, moments and coverage."""
+"""Statistics of a pattern that do not depend on the positions of its spots: wavelength, moments and coverage."""
 
 from collections.abc import Sequence
 
@@ -13,15 +13,15 @@ from .._tables import AnyArray
 
 
 class PatternStatistics(eqx.Module):
-    """Statistics of a field that do not depend on where its spots are; all differentiable.
+    """Differentiable statistics of a field that do not depend on the positions of its spots.
 
     Attributes:
-        wavelength: 2 pi / k with k^2 the field's Rayleigh quotient about its mean: that of the dominant mode, and a
-            little less for sharp profiles.
-        mean: the mean over the surface.
-        deviation: the standard deviation.
-        skewness: positive for peaks on a flat ground, negative for holes, near zero for stripes.
-        coverage: (L,) the shares of the surface above the levels.
+        wavelength: 2 pi / k, where k^2 is the Rayleigh quotient of the field minus its mean. It is the wavelength of
+            the dominant mode, and slightly less for sharp profiles.
+        mean: mean over the surface.
+        deviation: standard deviation.
+        skewness: skewness: positive for peaks on flat ground, negative for holes, near zero for stripes.
+        coverage: (L,) shares of the surface where the field is above each level.
     """
 
     wavelength: Float[Array, ""]
@@ -32,13 +32,13 @@ class PatternStatistics(eqx.Module):
 
     @property
     def histogram(self) -> Float[Array, " L1"]:
-        """(L + 1,) the shares of the surface below the first level, between one and the next, and above the last."""
+        """(L + 1,) shares of the surface below the first level, between consecutive levels, and above the last."""
         ends = jnp.ones(1, self.coverage.dtype)
         return -jnp.diff(jnp.concatenate([ends, self.coverage, 0 * ends]))
 
     @property
     def vector(self) -> Float[Array, " N"]:
-        """All of them in a row, for `Observations`."""
+        """(4 + L,) all statistics as a vector, for `Observations`."""
         return jnp.concatenate([jnp.stack([self.wavelength, self.mean, self.deviation, self.skewness]), self.coverage])
 
 
@@ -53,20 +53,20 @@ def pattern_statistics(
     """The statistics of a pattern.
 
     Args:
-        surface: where.
-        u: (V,) one species.
-        mass: (V,) the measure, ``surface.mass`` (asked for outside jit).
-        levels: ascending values above which the coverage is counted, and between which the histogram; by default none.
-        softness: of the counting, as a share of the field's deviation: a step would have no derivatives.
+        surface: the surface.
+        u: (V,) field of one species.
+        mass: (V,) measure, ``surface.mass`` (to be computed outside jit).
+        levels: (L,) ascending levels of coverage and histogram; by default none.
+        softness: width of the levels as a share of the standard deviation. A sharp level would have no derivatives.
     """
     u = jnp.asarray(u)
     area = jnp.sum(mass)
     mean = integrate(surface, u, mass) / area
-    rest = u - mean
-    variance = integrate(surface, rest**2, mass) / area
+    centred = u - mean
+    variance = integrate(surface, centred**2, mass) / area
     deviation = jnp.sqrt(variance)
-    k2 = -integrate(surface, rest * laplacian(surface, rest), mass) / (area * variance)
-    skewness = integrate(surface, rest**3, mass) / (area * deviation**3)
+    k2 = -integrate(surface, centred * laplacian(surface, centred), mass) / (area * variance)
+    skewness = integrate(surface, centred**3, mass) / (area * deviation**3)
     levels = jnp.zeros(0, u.dtype) if levels is None else jnp.asarray(levels, u.dtype)
     above = jax.nn.sigmoid((u[:, None] - levels[None]) / (softness * deviation))
     coverage = jnp.asarray(mass) @ above / area

@@ -1,7 +1,7 @@
-"""Unknowns without bounds: what is fitted becomes a flat vector on which any step is allowed.
+"""Unknowns without bounds: the fitted parameters become a flat vector on which any step is allowed.
 
-What enters: the user's parameters, a pytree, and the range that each may take. What leaves: `Unknowns`, which carries
-parameters to the vector and back.
+The input is the user's pytree of parameters and their ranges; the output is `Unknowns`, which maps the parameters to
+the vector and back.
 """
 
 from collections.abc import Callable
@@ -16,12 +16,12 @@ from jaxtyping import Array, Float
 
 from .._tables import AnyArray
 
-# A parameter this near to an end of its range, as a share of it, has run there if it is to go on.
+# A parameter counts as at the end of its range within this share of it, if the best value is beyond.
 _NEAR = 1e-3
 
 
 class Transform(eqx.Module):
-    """The range of a parameter: a smooth map from all numbers onto it, and back."""
+    """The range of a parameter: a smooth map from the real numbers onto the range, and its inverse."""
 
     def constrained(self, z: Array, scale: Array) -> Array:
         """The parameter of a free number."""
@@ -35,22 +35,22 @@ class Transform(eqx.Module):
         """Whether parameters are inside the range."""
         raise NotImplementedError
 
-    def at_end(self, x: np.ndarray, wanted: np.ndarray, scale: float) -> np.ndarray:
-        """Which parameters have run to an end of the range, where values beyond it are wanted."""
+    def at_end(self, x: np.ndarray, best: np.ndarray, scale: float) -> np.ndarray:
+        """Which parameters are at an end of the range because their best value is there or beyond."""
         raise NotImplementedError
 
 
 def start_of(transform: Transform, default: float) -> float:
-    """The first guess that a transform names; the default where it names none."""
+    """The start of a transform, or the default if it has none."""
     start = getattr(transform, "start", None)
     return default if start is None else float(start)
 
 
 class Real(Transform):
-    """Any number: x = scale z, with the start's root mean square as scale.
+    """Any real number: x = scale z, with the root mean square of the start as scale.
 
     Attributes:
-        start: the first guess where the fit is not given one otherwise, as for ``Observations(offset=Real(0.0))``.
+        start: first guess of an unknown that has no other, as in ``Observations(offset=Real(0.0))``.
     """
 
     start: float | None = None
@@ -67,9 +67,9 @@ class Real(Transform):
         """Whether all are finite."""
         return bool(np.isfinite(x).all())
 
-    def at_end(self, x, wanted, scale):
-        """None of them."""
-        del wanted, scale
+    def at_end(self, x, best, scale):
+        """False for all."""
+        del best, scale
         return np.zeros(np.shape(x), bool)
 
     def __str__(self):
@@ -77,10 +77,10 @@ class Real(Transform):
 
 
 class Positive(Transform):
-    """Positive numbers: x = exp(z), so that steps are relative ones.
+    """Positive numbers: x = exp(z), so that steps are relative changes.
 
     Attributes:
-        start: the first guess where the fit is not given one otherwise, as for ``Observations(scale=Positive(1.0))``.
+        start: first guess of an unknown that has no other, as in ``Observations(scale=Positive(1.0))``.
     """
 
     start: float | None = None
@@ -99,9 +99,9 @@ class Positive(Transform):
         """Whether all are positive."""
         return bool((np.isfinite(x) & (x > 0)).all())
 
-    def at_end(self, x, wanted, scale):
-        """Those next to zero."""
-        return (x < _NEAR * scale) & (wanted <= 0)
+    def at_end(self, x, best, scale):
+        """True next to zero."""
+        return (x < _NEAR * scale) & (best <= 0)
 
     def __str__(self):
         return "positive"
@@ -111,9 +111,9 @@ class Bounded(Transform):
     """Numbers between two bounds: x = low + (high - low) / (1 + exp(-z)).
 
     Attributes:
-        low: the lower bound.
-        high: the upper bound.
-        start: the first guess where the fit is not given one otherwise, as for ``Observations(scale=Bounded(...))``.
+        low: lower bound.
+        high: upper bound.
+        start: first guess of an unknown that has no other, as in ``Observations(scale=Bounded(...))``.
     """
 
     low: float
@@ -139,18 +139,18 @@ class Bounded(Transform):
         """Whether all are between the bounds."""
         return bool(((x > self.low) & (x < self.high)).all())
 
-    def at_end(self, x, wanted, scale):
-        """Those next to a bound."""
+    def at_end(self, x, best, scale):
+        """True next to a bound."""
         del scale
-        near = _NEAR * (self.high - self.low)
-        return ((x < self.low + near) & (wanted <= self.low)) | ((x > self.high - near) & (wanted >= self.high))
+        margin = _NEAR * (self.high - self.low)
+        return ((x < self.low + margin) & (best <= self.low)) | ((x > self.high - margin) & (best >= self.high))
 
     def __str__(self):
         return f"between {self.low:g} and {self.high:g}"
 
 
 class Unknowns(eqx.Module):
-    """Parameters and what is unknown about the measurement, together as a flat vector without bounds.
+    """The parameters and the unknowns of the measurement, together as a flat vector without bounds.
 
     Attributes:
         transforms: transform of each leaf.
@@ -165,7 +165,7 @@ class Unknowns(eqx.Module):
     unravel: Callable[[Array], tuple[Any, dict[str, Any]]] = eqx.field(static=True)
 
     def values(self, z: Float[Array, " n"]) -> tuple[Any, dict[str, Array]]:
-        """The parameters of a vector, and its calibration: what is unknown about the measurement, by name."""
+        """The parameters of a vector, and its calibration: the unknowns of the measurement, by name."""
         leaves, structure = jax.tree.flatten(self.unravel(z))
         each = zip(leaves, self.transforms, self.scales, strict=True)
         return structure.unflatten([transform.constrained(leaf, scale) for leaf, transform, scale in each])
@@ -175,7 +175,7 @@ class Unknowns(eqx.Module):
         return self.values(z)[0]
 
     def calibration(self, z: Float[Array, " n"]) -> dict[str, Array]:
-        """What a vector says of the measurement, by name."""
+        """The unknowns of the measurement in a vector, by name."""
         return self.values(z)[1]
 
     def free(self, values: tuple[Any, dict[str, Any]]) -> Float[Array, " n"]:
@@ -186,8 +186,8 @@ class Unknowns(eqx.Module):
 
     @property
     def reach(self) -> Float[Array, " n"]:
-        """The largest change of each entry in one step of a search: that of a factor of ten, where a transform makes
-        changes relative."""
+        """The largest change of each entry in one step of a search: a factor of ten if the transform makes changes
+        relative, no limit otherwise."""
         leaves = jax.tree.leaves(self.unravel(jnp.zeros(len(self.names), self.scales[0].dtype)))
         each = zip(leaves, self.transforms, strict=True)
         return jnp.concatenate([
@@ -196,18 +196,18 @@ class Unknowns(eqx.Module):
         ])  # fmt: skip
 
     def slopes(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The derivative of every value with respect to its own entry."""
+        """The derivative of each value with respect to its own entry of the vector."""
         _, slopes = jax.jvp(lambda z: ravel_pytree(self.values(z))[0], (z,), (jnp.ones_like(z),))
         return slopes
 
-    def at_end(self, values: Any, wanted: np.ndarray) -> np.ndarray:
-        """(n,) whether each value has run to an end of its range, where values (n,) beyond it are wanted."""
-        found, begin = [], 0
+    def at_end(self, values: Any, best: np.ndarray) -> np.ndarray:
+        """(n,) whether each value is at an end of its range because its best value (n,) is there or beyond."""
+        is_at_end, begin = [], 0
         for leaf, transform, scale in zip(jax.tree.leaves(values), self.transforms, self.scales, strict=True):
             x = np.ravel(np.asarray(leaf, np.float64))
-            found.append(transform.at_end(x, wanted[begin : begin + x.size], float(scale)))
+            is_at_end.append(transform.at_end(x, best[begin : begin + x.size], float(scale)))
             begin += x.size
-        return np.concatenate(found)
+        return np.concatenate(is_at_end)
 
 
 def unknowns(
@@ -216,13 +216,13 @@ def unknowns(
     """The unknowns of a fit.
 
     Args:
-        start: a pytree of floats or float arrays.
-        transforms: a pytree of `Transform` that ``start`` continues, None for `Real`; one for all of them, or one for
-            each entry of a dictionary.
-        calibration: first guess, transform and typical size of what is unknown about the measurement, by name.
+        start: first guess: a pytree of floats or float arrays.
+        transforms: a prefix of the pytree ``start`` with leaves `Transform`, or None for `Real`: one for all
+            parameters, or one for each entry of a dictionary.
+        calibration: first guess, transform and typical size of each unknown of the measurement, by name.
 
     Raises:
-        ValueError: a parameter is no float, outside its range, or a transform belongs to none.
+        ValueError: a parameter is not a float or is outside its range, or a transform belongs to no parameter.
     """
     calibration = calibration or {}
     own = _chosen(start, transforms)
@@ -239,8 +239,8 @@ def unknowns(
         if not np.issubdtype(values.dtype, np.floating):
             raise ValueError(f"Expected parameter {name} to be a float or an array of floats, found {leaf!r}.")
         if not transform.admits(values):
-            found = f"{values:g}" if values.ndim == 0 else f"values from {values.min():g} to {values.max():g}"
-            raise ValueError(f"Expected the start of {name} to be {transform}, found {found}.")
+            range_ = f"{values:g}" if values.ndim == 0 else f"values from {values.min():g} to {values.max():g}"
+            raise ValueError(f"Expected the start of {name} to be {transform}, found {range_}.")
         size = float(np.sqrt(np.mean(values**2, dtype=np.float64))) if size is None else size
         scales.append(jnp.asarray(size if size > 0 else 1.0, dtype))
         indices = np.ndindex(values.shape) if values.ndim else [()]
@@ -250,13 +250,13 @@ def unknowns(
 
 
 def _chosen(start: Any, transforms: Any) -> list[Transform]:
-    """The transform of every leaf of the parameters."""
+    """The transform of each leaf of the parameters."""
     if not jax.tree.leaves(start):
         raise ValueError("Expected at least one parameter to fit, found none.")
     if isinstance(transforms, dict) and isinstance(start, dict):
         if unknown := sorted(set(transforms) - set(start)):
             raise ValueError(
-                f"There is no parameter {unknown[0]!r} to transform; there are {', '.join(map(str, start))}."
+                f"There is no parameter {unknown[0]!r} for its transform; there are {', '.join(map(str, start))}."
             )
         transforms = {key: transforms.get(key) for key in start}
     is_transform = lambda x: x is None or isinstance(x, Transform)  # noqa: E731
@@ -266,12 +266,12 @@ def _chosen(start: Any, transforms: Any) -> list[Transform]:
             transforms, start, is_leaf=is_transform,
         )  # fmt: skip
     except ValueError as error:
-        raise ValueError(f"The transforms do not have the structure of the parameters: {error}") from None
+        raise ValueError(f"Expected transforms in the structure of the parameters: {error}") from None
     leaves = jax.tree.leaves(chosen, is_leaf=lambda x: isinstance(x, Transform))
     for transform in leaves:
         if getattr(transform, "start", None) is not None:
             raise ValueError(
-                f"Expected a transform without a start, found {transform!r}: parameters begin at the start of the fit."
+                f"Expected a transform without a start, found {transform!r}. The start of fit() is the first guess."
             )
     return leaves
 

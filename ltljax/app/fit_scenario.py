@@ -80,7 +80,7 @@ def recover(
             solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
         )  # fmt: skip
         found = fit(
-            experiment, wanted.start, data, transforms=Positive(), max_steps=wanted.max_steps, progress=True,
+            experiment, wanted.start, data, transforms=Positive(), max_iterations=wanted.max_steps, progress=True,
             checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),
         )  # fmt: skip
         numbers = np.argsort(example.mesh.source_order)
@@ -132,7 +132,7 @@ def _rows(wanted: Wanted, found: Fit, numbers: np.ndarray) -> list[dict[str, Any
 def _write(example: Scenario, found: Fit, outliers: list[dict[str, Any]], out: Path) -> list[str]:
     numbers = {key: float(value) for key, value in found.params.items()}
     record: dict[str, Any] = dict(
-        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_steps, runs=found.num_runs,
+        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_iterations, runs=found.num_runs,
         reason=found.reason, status=found.status, converged=found.converged, method=found.method,
         scanned=found.scanned, explanation=found.agreement.sentence(),
         agreement=dataclasses.asdict(found.agreement) | dict(outliers=outliers),
