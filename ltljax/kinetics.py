@@ -1,9 +1,10 @@
 """Reaction kinetics: how species change each other at a point, ``((u, v), params) -> (du, dv)``.
 
-Patterns: `turk`, `gray_scott`, `schnakenberg`, `brusselator`, `barrio`, `gierer_meinhardt`, `meinhardt`. Fronts, waves
-and spirals: `barkley`, `fitzhugh_nagumo`, `allen_cahn`, `ginzburg_landau`, `fisher_kpp`, `lotka_volterra`.
+Patterns: `turing`, `gray_scott`, `schnakenberg`, `brusselator`, `barrio`, `gierer_meinhardt`, `meinhardt`. Fronts,
+waves and spirals: `barkley`, `fitzhugh_nagumo`, `allen_cahn`, `ginzburg_landau`, `fisher_kpp`, `lotka_volterra`.
 """
 
+from ._base.deprecated import deprecated_alias
 from ._equations.kinetics import (
     Kinetics,
     allen_cahn,
@@ -18,7 +19,7 @@ from ._equations.kinetics import (
     lotka_volterra,
     meinhardt,
     schnakenberg,
-    turk,
+    turing,
 )
 
 __all__ = [
@@ -35,8 +36,12 @@ __all__ = [
     "lotka_volterra",
     "meinhardt",
     "schnakenberg",
-    "turk",
+    "turing",
 ]
+
+
+# Turing's system by its name in version 0.1.
+turk = deprecated_alias("ltljax.kinetics.turk", turing)
 
 
 def __dir__() -> list[str]:

@@ -33,8 +33,8 @@ MESHES = Path(__file__).parents[2] / "shared" / "meshes"
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 
 
-# The slowest files start first, so that no process is still running one of them when the others have finished.
-_LONGEST = ("notebooks", "robustness", "process", "recovery", "fit", "taped", "steppers", "scenarios", "distance")
+# The files that take longest, which begin first, so that no process is left alone with one of them in the end.
+_LONGEST = ("notebooks", "robustness", "process", "fits_find_the_truth", "fit", "taped", "steppers", "distance")
 
 
 def pytest_collection_modifyitems(items):

@@ -1,4 +1,4 @@
-"""Formulas compute what they say, are differentiated, and run nothing."""
+"""Formulas have the value of the same arithmetic, are differentiable, and execute no code."""
 
 import math
 
@@ -12,7 +12,7 @@ from ltljax.app.scenario.formulas import Formula, FormulaError, functions, parse
 
 NAMES = ("a", "u", "v", "x", "y", "z")
 
-# Trees of Python's own arithmetic beside the text of the formula; powers with whole exponents alone.
+# The text of a formula, and a Python function with the same value. Powers have integer exponents only.
 leaves = st.one_of(
     st.floats(0.1, 3).map(lambda value: (repr(value), lambda u, v, value=value: value)),
     st.sampled_from([("u", lambda u, v: u), ("v", lambda u, v: v), ("pi", lambda u, v: math.pi)]),
@@ -20,7 +20,7 @@ leaves = st.one_of(
 
 
 def limited(value):
-    """The value, if it is small: the sine of a large number, and a difference of two, are made of their rounding."""
+    """The value, if it is small: the sine of a large number, or a difference of two, consists of rounding errors."""
     if abs(value) > 1e4:
         raise OverflowError
     return value
@@ -87,9 +87,9 @@ def test_powers_are_differentiated_at_zero_and_for_negative_bases():
 def test_a_formula_works_on_fields_in_their_float_type(dtype):
     formula = parse("where(z > 0, a*u^2, 0.1) + sin(pi*u)/2", NAMES)
     u, z = jnp.linspace(-1, 1, 5, dtype=dtype), jnp.array([1, -1, 1, -1, 1], dtype)
-    found = jax.jit(lambda u: formula(u=u, z=z, a=jnp.asarray(2.0, dtype)))(u)
-    assert found.dtype == dtype
-    np.testing.assert_allclose(found, np.where(z > 0, 2 * u**2, 0.1) + np.sin(np.pi * u) / 2, rtol=1e-5)
+    values = jax.jit(lambda u: formula(u=u, z=z, a=jnp.asarray(2.0, dtype)))(u)
+    assert values.dtype == dtype
+    np.testing.assert_allclose(values, np.where(z > 0, 2 * u**2, 0.1) + np.sin(np.pi * u) / 2, rtol=1e-5)
     assert formula.names == ("a", "u", "z")
 
 
@@ -117,7 +117,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize("text", BROKEN)
-def test_what_is_no_formula_is_one_clear_error(text):
+def test_a_text_that_is_not_a_formula_is_one_clear_error(text):
     with pytest.raises(FormulaError, match=r"(?s)[Ee]xpected .*found"):
         parse(text, NAMES)
 
@@ -134,7 +134,7 @@ def test_errors_name_the_column_and_the_near_miss():
 
 @settings(max_examples=300, deadline=None)
 @given(st.text(alphabet="auv0123456789.()+-*/^<>=!, sincowhreanot_e\"'[]{}", max_size=60))
-def test_no_text_does_more_than_parse_or_say_why_not(text):
+def test_any_text_is_parsed_or_refused(text):
     try:
         formula = parse(text, NAMES)
     except FormulaError:
@@ -142,6 +142,30 @@ def test_no_text_does_more_than_parse_or_say_why_not(text):
     jnp.asarray(formula(**dict.fromkeys(formula.names, 1.0)))
 
 
-def test_a_name_may_be_that_of_python():
-    found = parse("self + values", ("self", "values"))
-    assert float(found(**{"self": 1.0, "values": 2.0})) == 3
+def test_a_name_may_be_a_word_of_python():
+    formula = parse("self + values*lambda", ("self", "values", "lambda"))
+    assert float(formula(**{"self": 1.0, "values": 2.0, "lambda": 3.0})) == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "expected"),
+    [
+        ("a + 1 )", 7, "an operator or the end, found ')'"),
+        ("2*(a + ", 8, "a number, a name or '(', found the end"),
+        ("2*(a + u", 9, "an operator or ')', found the end"),
+        ("a < u < v", 7, "'and' between two comparisons, found '<'"),
+        ("a < (u) < v", 9, "'and' between two comparisons, found '<'"),
+        ("min(a, (u))) + 1", 12, "an operator or the end, found ')'"),
+        ("min(a, u, v)", 9, "')' after the 2 arguments of min, found ','"),
+        ("min((a))", 8, "',' between the 2 arguments of min, found ')'"),
+        ("a + , u", 5, "a number, a name or '(', found ','"),
+        ("(a + u, v)", 7, "an operator or the end, found ','"),
+        ("a * not u", 5, "'(' before 'not', found 'not'"),
+        ("1e999 + a", 1, "a number of at most 1e308, found '1e999'"),
+        ("a^2 + u ? v", 9, "a number, a name, an operator or a parenthesis, found '?'"),
+    ],
+)
+def test_errors_point_at_the_first_mistake(text, column, expected):
+    with pytest.raises(FormulaError) as error:
+        parse(text, NAMES)
+    assert str(error.value) == f'"{text}", column {column}: expected {expected}.'

@@ -11,7 +11,7 @@ from ltljax.app.run import count_maxima
 
 NAMES = [name for name in ltl.kinetics.__all__ if name.islower()]
 # Reactions whose species stay non-negative.
-POSITIVE = ["turk", "gray_scott", "schnakenberg", "brusselator", "gierer_meinhardt", "meinhardt", "barkley"]
+POSITIVE = ["turing", "gray_scott", "schnakenberg", "brusselator", "gierer_meinhardt", "meinhardt", "barkley"]
 POSITIVE += ["fisher_kpp", "lotka_volterra"]
 
 
@@ -87,12 +87,12 @@ def test_a_reaction_without_a_known_steady_state_asks_for_one():
 
 
 def test_turings_system_has_the_known_band_of_growing_modes():
-    dispersion = ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.8, 0.1))
+    dispersion = ltl.solvers.dispersion(ltl.kinetics.turing(rate=1.0), (0.8, 0.1))
     np.testing.assert_allclose(dispersion.band, (2.2, 22.8), atol=0.06)
     np.testing.assert_allclose(dispersion.fastest, (8.2, 0.77), atol=0.06)
     assert dispersion.forms_pattern
-    assert not ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.39, 0.1)).forms_pattern
-    assert ltl.solvers.dispersion(ltl.kinetics.turk(rate=1.0), (0.41, 0.1)).forms_pattern
+    assert not ltl.solvers.dispersion(ltl.kinetics.turing(rate=1.0), (0.39, 0.1)).forms_pattern
+    assert ltl.solvers.dispersion(ltl.kinetics.turing(rate=1.0), (0.41, 0.1)).forms_pattern
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -106,7 +106,7 @@ def test_growth_rates_are_the_largest_eigenvalues_of_the_linearised_reaction(nam
 
 
 def test_growth_rates_are_differentiable():
-    rate = lambda decay: ltl.solvers.dispersion(ltl.kinetics.turk(1.0, decay=decay), (0.8, 0.1)).growth(8.0)  # noqa: E731
+    rate = lambda decay: ltl.solvers.dispersion(ltl.kinetics.turing(1.0, decay=decay), (0.8, 0.1)).growth(8.0)  # noqa: E731
     assert jax.grad(rate)(12.0) == pytest.approx(float((rate(12.001) - rate(11.999)) / 0.002), rel=1e-5)
 
 
@@ -139,17 +139,18 @@ def test_noise_grows_at_the_wavelength_of_linear_theory(sphere):
 def test_explain_reports_no_pattern_for_the_published_torus():
     surface = ltl.Surface.from_mesh(ltl.shapes.torus(n_major=48, n_minor=24))
     # alpha = 1, beta = s = 2, gamma = 0
-    published = ltl.ReactionDiffusion((1.0, 2.0), ltl.kinetics.turk(rate=2.0, decay=0.0))
+    published = ltl.ReactionDiffusion((1.0, 2.0), ltl.kinetics.turing(rate=2.0, decay=0.0))
     explanation = ltl.explain(published, surface)
     assert not explanation.forms_pattern
     assert str(explanation).startswith("No pattern")
     assert "no diffusivities would make one" in str(explanation)
     for diffusivity in ((1.0, 0.01), (10.0, 0.1)):
-        assert not ltl.explain(ltl.ReactionDiffusion(diffusivity, ltl.kinetics.turk(decay=0.0)), surface).forms_pattern
+        equation = ltl.ReactionDiffusion(diffusivity, ltl.kinetics.turing(decay=0.0))
+        assert not ltl.explain(equation, surface).forms_pattern
 
 
 def test_explain_counts_the_modes_of_the_surface(sphere):
-    equation = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turk(rate=1.0))
+    equation = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turing(rate=1.0))
     explanation = ltl.explain(equation, sphere)
     assert explanation.forms_pattern
     # l (l + 1) lies between 2.2 and 22.8 for l = 2, 3, 4.
@@ -160,7 +161,7 @@ def test_explain_counts_the_modes_of_the_surface(sphere):
 
 def test_explain_names_the_obstacle_to_a_pattern(sphere):
     def explanation(diffusivity, **parameters):
-        return str(ltl.explain(ltl.ReactionDiffusion(diffusivity, ltl.kinetics.turk(**parameters)), sphere))
+        return str(ltl.explain(ltl.ReactionDiffusion(diffusivity, ltl.kinetics.turing(**parameters)), sphere))
 
     assert "more than 4 times" in explanation((0.3, 0.1))
     assert "does not resolve" in explanation((0.008, 0.001))
@@ -218,7 +219,7 @@ def pattern(level, diffusivity, kinetics, t1, amplitude=0.1, seed=0):
 
 @pytest.mark.slow
 def test_turings_system_forms_about_forty_spots():
-    u, _, mesh = pattern(4, (0.8, 0.1), ltl.kinetics.turk(), 40.0)
+    u, _, mesh = pattern(4, (0.8, 0.1), ltl.kinetics.turing(), 40.0)
     assert 30 <= count_maxima(mesh, -np.asarray(u[:, 1])) + count_maxima(mesh, np.asarray(u[:, 1])) <= 120
 
 

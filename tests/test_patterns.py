@@ -90,7 +90,7 @@ def test_stripes_are_long_and_cover_half(name):
     [
         "schnakenberg",
         *map(slow, ("barrio-spots", "barrio-stripes", "fitzhugh-nagumo", "gierer-meinhardt", "meinhardt-stripes")),
-        slow("turk"),
+        slow("turing-ridges"),
     ],
 )
 def test_the_first_wavelength_is_that_of_linear_theory(name):
@@ -106,8 +106,8 @@ def test_the_first_wavelength_is_that_of_linear_theory(name):
     # The decay rates of these two scenarios vary from vertex to vertex.
     if name == "meinhardt-stripes":
         uniform = ltl.ReactionDiffusion((4e-5, 4e-5, 0.0, 9e-4, 9e-4), ltl.kinetics.meinhardt())
-    elif name == "turk":
-        uniform = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turk(rate=10.0, decay=12.0))
+    elif name == "turing-ridges":
+        uniform = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turing(rate=10.0, decay=12.0))
     u = ltl.solve(uniform, surface, u0, 8 / dispersion.fastest[1], rtol=1e-5, atol=1e-10).u_end
     assert wavelength(surface, u[:, 0] - rest[0]) == pytest.approx(dispersion.wavelength, rel=0.1)
     assert contents.species[0] in ("u", "g")
@@ -133,7 +133,7 @@ def test_the_brusselators_first_wavelength_outgrows_its_oscillation(kind, level)
 
 def test_turings_spots_have_the_known_number_and_height():
     """About 40 spots, with u from 2.3 to 6.4 and v from 0 to 9.9, up to the variation between random seeds."""
-    us, _, _, contents = run_scenario("turk")
+    us, _, _, contents = run_scenario("turing-ridges")
     u, v = us[-1].T
     assert abs(count_maxima(contents.mesh, v) - 40) <= 8
     np.testing.assert_allclose([u.min(), u.max()], [2.3, 6.4], atol=0.3)

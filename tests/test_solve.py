@@ -130,7 +130,7 @@ def test_turks_reaction_keeps_v_from_negative_and_makes_a_pattern(mesh, real_mes
     mesh = mesh.scaled(np.sqrt(4 * np.pi / mesh.area))
     surface = ltl.Surface.from_mesh(mesh)
     decay = 11 + np.random.default_rng(0).uniform(-0.1, 0.1, mesh.num_vertices)
-    equation = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turk(decay=jnp.asarray(decay)))
+    equation = ltl.ReactionDiffusion((0.8, 0.1), ltl.kinetics.turing(decay=jnp.asarray(decay)))
     u = ltl.solve(equation, surface, jnp.full((mesh.num_vertices, 2), 4.0), 40.0).us[-1]
     assert u.min() > -1e-3
     assert 30 <= count_maxima(mesh, np.asarray(u[:, 1])) <= 60

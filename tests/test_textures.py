@@ -177,7 +177,7 @@ def unwrapped(path, mesh):
 
 # A scenario for each surface, and the settings that differ from its defaults.
 SURFACES = {
-    "spot": ("turk", ["--t1", "20", "--set", 'kinetics.decay="11 + 0.1*noise"']),
+    "spot": ("turing-ridges", ["--t1", "20", "--set", 'kinetics.decay="11 + 0.1*noise"']),
     "bunny": ("barrio-spots", ["--set", 'diffusivity.u="0.516*0.006"', "--set", "diffusivity.v=0.006"]),
     "disk": ("fitzhugh-nagumo", ["--set", "diffusivity.u=5e-4", "--set", "diffusivity.v=5e-2"]),
     "torus": ("spirals", ["--t1", "10", "--set", "mesh.n_major=96", "--set", "mesh.n_minor=48"]),

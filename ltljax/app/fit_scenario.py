@@ -1,6 +1,6 @@
-"""A scenario with a table ``[fit]`` becomes the numbers that explain what was seen, and files.
+"""A scenario with a table ``[fit]`` is fitted to its measurements.
 
-What enters: a `Scenario`. What leaves: a folder with a report, a picture, and the scenario with the numbers found.
+What enters: a `Scenario`. What leaves: a folder with a report, a picture, and the scenario with the fitted numbers.
 """
 
 import dataclasses
@@ -11,100 +11,95 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import tomli_w
 
 from .._base.folder import Folder
-from .._base.progress import noted
 from .._fit import Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
-from .._lifting.schemes import Scheme
 from .._solve.restart import RestartError
-from .._surface import FarFromOriginWarning, Surface
-from .scenario import Places, Scenario, ScenarioError, Wanted
+from .._surface import Surface
+from .record import INTERRUPTED, NO_PICTURES, scenario_toml
+from .scenario import FitTask, Places, Scenario, ScenarioError
 
 _RESULTS = ("fit.json", "fitted.toml", "fit.png")
 _UNKNOWNS = "unknowns.npz"
-_WAYS = "Continue it with --resume, start over with --overwrite, or name another --out."
 
 
-def recover(
-    example: Scenario,
+def fit_scenario(
+    scenario: Scenario,
     *,
-    scheme: Scheme,
     out: Path,
     inputs: Iterable[Path] = (),
     resume: bool = False,
     overwrite: bool = False,
 ) -> Fit:
-    """Fit the numbers that a scenario leaves free, and write what was found.
+    """Fit the unknowns of a scenario and write the results; returns the fit.
 
-    In the folder ``out``: ``fit.json`` (numbers, intervals, singular values), ``fit.png`` with the extra `viz`,
-    ``fitted.toml``, the scenario with the numbers found, to be run; and ``restart/unknowns.npz``, to resume from, until
-    the fit has settled.
+    The folder ``out`` receives ``fit.json`` (fitted numbers, intervals, singular values); ``fit.png``, with the extra
+    `viz`; ``fitted.toml``, a scenario with the fitted numbers; and, until the fit has settled,
+    ``restart/unknowns.npz``, from which it can be resumed.
 
     Args:
-        example: the scenario.
-        scheme: of the operators.
-        out: the folder to write to; made if absent.
-        inputs: files that are read beside those the scenario names, and must not be replaced.
-        resume: whether to begin with what an interrupted fit of the same data left there.
+        scenario: the scenario.
+        out: folder for the results; made if absent.
+        inputs: files that the fit depends on, besides those that the scenario names.
+        resume: whether to start from the unknowns that an interrupted fit of the same data left there.
         overwrite: whether to start over although the folder holds a fit that has not settled.
 
     Raises:
         ValueError: the scenario has no table ``[fit]``.
-        OutputError: the results would replace one of the files that are read, or one that ltljax has not written; or
-            another fit is writing there.
-        RestartError: the folder holds another fit, or one that has not settled and neither ``resume`` nor
-            ``overwrite`` was given.
+        OutputError: the results would replace an input or a file that ltljax did not write, or another fit is writing
+            to ``out``.
+        RestartError: the folder holds another fit, or one that has not settled and is neither to be resumed nor to be
+            overwritten.
         FitError: the run fails at the first guess.
     """
-    wanted = example.wanted
-    if wanted is None:
+    task = scenario.fit_task
+    if task is None:
         raise ValueError(
-            f"{example.name} has no table [fit]: name the numbers to find as free = [...] and files of data as "
-            "[[fit.data]] with file and time."
+            f"{scenario.name} has no table [fit]. Add one that names the unknowns as free = [...] and the files of "
+            "measurements as [[fit.data]] with file and time; ltljax new fit prints an example."
         )
     folder, restart = Folder(out), Folder(out / "restart")
-    folder.check(_RESULTS, (*inputs, *example.files.values(), *wanted.files))
-    if restart.owns(_UNKNOWNS) and not resume and not overwrite:
-        raise RestartError(f"{restart.path} holds a fit that has not converged. {_WAYS}")
-    settings = example.settings
-    with noted(FarFromOriginWarning):
-        surface = Surface.from_mesh(example.mesh, scheme, settings.dtype)
+    folder.check(_RESULTS, (*inputs, *scenario.files.values()))
+    is_interrupted = restart.owns(_UNKNOWNS)
+    if is_interrupted and not resume and not overwrite:
+        raise RestartError(f"{restart.path} holds a fit that has not converged. {INTERRUPTED}")
+    settings = scenario.settings
+    surface = scenario.make_surface()
     try:
-        data = _observations(wanted, surface)
+        data = _observations(task, surface)
     except ValueError as error:
-        raise ScenarioError(f"{example.name}: fit: {error}") from None
+        raise ScenarioError(f"{scenario.name}: fit: {error}") from None
     with folder.locked():
         experiment = Experiment(
-            lambda free: example.make_equation(surface, free), surface, jnp.asarray(example.u0, surface.dtype),
+            lambda free: scenario.make_equation(surface, free), surface, jnp.asarray(scenario.u0, surface.dtype),
             solver=settings.solver, dt=settings.dt, rtol=settings.rtol, atol=settings.atol,
         )  # fmt: skip
-        found = fit(
-            experiment, wanted.start, data, transforms=Positive(), max_iterations=wanted.max_steps, progress=True,
-            checkpoint=restart.path / _UNKNOWNS, resume=resume and restart.owns(_UNKNOWNS),
+        result = fit(
+            experiment, task.start, data, transforms=Positive(), max_iterations=task.max_iterations, progress=True,
+            checkpoint=restart.path / _UNKNOWNS, resume=resume and is_interrupted,
         )  # fmt: skip
-        numbers = np.argsort(example.mesh.source_order)
-        print(found.summary(numbers))
+        numbers_in_file = np.argsort(scenario.mesh.source_order)
+        print(result.summary(numbers_in_file))
         with folder.draft() as draft:
-            files = _write(example, found, _rows(wanted, found, numbers), draft)
-        if found.has_settled:
+            files = _write(scenario, result, _outliers(task, result, numbers_in_file), draft)
+        if result.has_settled:
             with restart.locked():
                 restart.remove_itself()
     print(f"written to {out}: {', '.join(files)}")
-    return found
+    return result
 
 
-def _observations(wanted: Wanted, surface: Surface) -> Observations:
-    """The data on the surface.
+def _observations(task: FitTask, surface: Surface) -> Observations:
+    """The measurements on the surface.
 
     Raises:
         ValueError: a point is far from the surface, a patch has no vertices, or the values do not suit the noise.
     """
-    options = dict(wanted.options)
+    options = dict(task.options)
     for key, unknown in (("scale", Positive(1.0)), ("offset", Real(0.0))):
         if options.get(key) is True:
             options[key] = unknown
-    places = wanted.places
+    places = task.places
     if places.points is not None:
         options["operator"] = observe_at(surface, places.points)
     elif places.operator is not None:
@@ -113,59 +108,64 @@ def _observations(wanted: Wanted, surface: Surface) -> Observations:
         options["operator"] = observe_patches(surface, places.patches)
     else:
         options["vertices"] = places.vertices
-    return Observations(wanted.values, times=wanted.times, species=wanted.species, **options)
+    return Observations(task.values, times=task.times, species=task.species, **options)
 
 
-def _rows(wanted: Wanted, found: Fit, numbers: np.ndarray) -> list[dict[str, Any]]:
-    """The outliers by time, by the row of their file, from 0, and by species."""
-    is_whole = wanted.places.is_same(Places())
+def _outliers(task: FitTask, result: Fit, numbers_in_file: np.ndarray) -> list[dict[str, Any]]:
+    """The time, the row in the file (from 0) and the species of every outlier."""
+    is_everywhere = task.places.is_same(Places())
     return [
         dict(
-            time=float(wanted.times[when]),
-            row=int(numbers[where] if is_whole else where),
-            species=int(wanted.species[s]),
+            time=float(task.times[time]),
+            row=int(numbers_in_file[place] if is_everywhere else place),
+            species=int(task.species[s]),
         )
-        for when, where, s in found.agreement.outliers.tolist()
+        for time, place, s in result.agreement.outliers.tolist()
     ]
 
 
-def _write(example: Scenario, found: Fit, outliers: list[dict[str, Any]], out: Path) -> list[str]:
-    numbers = {key: float(value) for key, value in found.params.items()}
-    record: dict[str, Any] = dict(
-        scenario=example.name, found=numbers, loss=found.loss, steps=found.num_iterations, runs=found.num_runs,
-        reason=found.reason, status=found.status, converged=found.converged, method=found.method,
-        scanned=found.scanned, explanation=found.agreement.sentence(),
-        agreement=dataclasses.asdict(found.agreement) | dict(outliers=outliers),
-        calibration={name: np.asarray(value).tolist() for name, value in found.calibration.items()},
-    )  # fmt: skip
-    if (known := found.evidence) is not None:
-        low, high = known.intervals
-        record |= dict(
-            std=dict(zip(known.names, known.std.tolist(), strict=True)),
-            confidence=known.confidence,
-            intervals={key: (float(low[key]), float(high[key])) for key in numbers},
-            ends=dict(zip(known.names, known.ends.T.tolist(), strict=True)),
-            singular_values=known.singular_values.tolist(),
-            noise=known.noise,
-            cannot_tell=known.cannot_tell,
-        )
-    record = json.loads(json.dumps(record), parse_constant=lambda _: None)  # NaN and infinity are no JSON
+def _write(scenario: Scenario, result: Fit, outliers: list[dict[str, Any]], out: Path) -> list[str]:
+    """Write all results; returns the names of the files."""
+    numbers = {key: float(value) for key, value in result.params.items()}
+    # JSON has no NaN and no infinity.
+    record = json.loads(json.dumps(_record(scenario, result, numbers, outliers)), parse_constant=lambda _: None)
     (out / "fit.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    files = ["fit.json"]
-    tables = json.loads(json.dumps(example.resolved))  # a copy of plain values
-    tables.pop("fit", None)
-    for key, value in numbers.items():
-        table, name = key.split(".")
-        tables[table][name] = value
-    text = tomli_w.dumps({key: value for key, value in tables.items() if value not in ({}, [])})
-    head = "# With the numbers found: ltljax run fitted.toml, beside the files it names\n"
-    (out / "fitted.toml").write_text(head + text, encoding="utf-8")
-    files.append("fitted.toml")
+    tables = {key: value for key, value in scenario.tables.items() if key != "fit"}
+    text = scenario_toml(
+        tables, numbers, "The scenario with the fitted numbers: ltljax run fitted.toml, beside its files"
+    )
+    (out / "fitted.toml").write_text(text, encoding="utf-8")
+    files = ["fit.json", "fitted.toml"]
     try:
-        figure = found.plot()
+        figure = result.plot()
     except ImportError:
-        print('note: pictures need the extra "viz": pip install "ltljax[viz]"')
+        print(NO_PICTURES)
     else:
         figure.savefig(out / "fit.png", dpi=110)
         files.append("fit.png")
     return files
+
+
+def _record(
+    scenario: Scenario, result: Fit, numbers: dict[str, float], outliers: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """The contents of ``fit.json``."""
+    record: dict[str, Any] = dict(
+        scenario=scenario.name, found=numbers, loss=result.loss, steps=result.num_iterations, runs=result.num_runs,
+        reason=result.reason, status=result.status, converged=result.converged, method=result.method,
+        scanned=result.scanned, explanation=result.agreement.sentence(),
+        agreement=dataclasses.asdict(result.agreement) | dict(outliers=outliers),
+        calibration={name: np.asarray(value).tolist() for name, value in result.calibration.items()},
+    )  # fmt: skip
+    if (evidence := result.evidence) is not None:
+        low, high = evidence.intervals
+        record |= dict(
+            std=dict(zip(evidence.names, evidence.std.tolist(), strict=True)),
+            confidence=evidence.confidence,
+            intervals={key: (float(low[key]), float(high[key])) for key in numbers},
+            ends=dict(zip(evidence.names, evidence.ends.T.tolist(), strict=True)),
+            singular_values=evidence.singular_values.tolist(),
+            noise=evidence.noise,
+            cannot_tell=evidence.cannot_tell,
+        )
+    return record

@@ -12,7 +12,7 @@ from .kinetics import Kinetics, with_params
 Number = float | Array
 
 
-def turk(rate: Number = 10.0, feed: Number = 16.0, decay: Number = 12.0, floor: Number = 0.05) -> Kinetics:
+def turing(rate: Number = 10.0, feed: Number = 16.0, decay: Number = 12.0, floor: Number = 0.05) -> Kinetics:
     """du/dt = s (alpha - u v), dv/dt = s (u v - v - beta): Turing's system in Turk's form, with v kept from negative.
 
     As published v can turn negative, and then both species overflow. Here the sink beta acts in full where v is at
@@ -32,17 +32,17 @@ def turk(rate: Number = 10.0, feed: Number = 16.0, decay: Number = 12.0, floor: 
     Source: Turk (1991), doi:10.1145/127719.122749; Chen, Chi and Wu, arXiv 0907.1817, section 4, print
     s (u1 u2 - u2 - gamma) for the second rate.
     """
-    return with_params(_turk, ("u", "v"), _turk_at_rest, rate=rate, feed=feed, decay=decay, floor=floor)
+    return with_params(_turing, ("u", "v"), _turing_at_rest, rate=rate, feed=feed, decay=decay, floor=floor)
 
 
-def _turk(species, p):
+def _turing(species, p):
     u, v = species
     present = jnp.maximum(v, 0)
     sink = p["decay"] * jnp.clip(v / p["floor"], 0, 1)
     return p["rate"] * (p["feed"] - u * present), p["rate"] * (u * present - v - sink)
 
 
-def _turk_at_rest(p):
+def _turing_at_rest(p):
     v = p["feed"] - p["decay"]
     return p["feed"] / v, v
 

@@ -1,6 +1,6 @@
-"""Commands on a mesh file: denoise, smooth, lic, curvature, distance.
+"""The commands on a mesh: denoise, smooth, lic, curvature, distance.
 
-What enters: the name of a mesh and what to do with it. What leaves: a folder with pictures, data and a record of both.
+What enters: the name of a mesh and the options of a command. What leaves: a folder with pictures, data and a record.
 """
 
 from .images import denoise

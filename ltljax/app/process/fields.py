@@ -1,6 +1,6 @@
-"""Which directions does a picture of lines show? Those of curvature, of a field of crosses, or of a rotation.
+"""The direction fields whose lines a picture shows: directions of curvature, a field of crosses, or a rotation.
 
-What enters: a `Subject` and the name of a field. What leaves: tangent vectors on its vertices.
+What enters: a `Subject` and the name of a field. What leaves: tangent vectors at its vertices.
 """
 
 import jax.numpy as jnp
@@ -15,24 +15,24 @@ from ..._solve import direction_field
 from ..._surface import Surface
 from .subject import Subject
 
-FIELDS = ("smallest", "largest", "cross", "rotation")
-# For how long directions of curvature are smoothed, in squared edge lengths.
+# The time for which directions of curvature are smoothed, in squared edge lengths.
 _SMOOTHING = 1.0
-# Of the largest curvature, how far apart the two are that count as equal: files round positions to six digits.
+# Principal curvatures count as equal if they differ by less than this share of the largest curvature. Files round
+# positions to six digits.
 _EQUAL = 3e-3
 
 
 def line_fields(subject: Subject, name: str) -> list[Float[Array, "V 3"]]:
-    """The fields that a name stands for: one, or the two of the crosses.
+    """The fields with a name: one field, or the two fields of the crosses.
 
-    Directions are unit vectors; the rotation is about the vertical through the middle, longer the farther from it, and
-    zero on it.
+    Directions are unit vectors. The rotation is about the vertical axis through the middle of the mesh; its length is
+    proportional to the distance from the axis.
 
-    Directions of curvature are smoothed over an edge, each with the weight of the difference of the two curvatures:
-    where both are equal there is no direction, and its surroundings decide.
+    Directions of curvature are smoothed over an edge, weighted by the difference of the principal curvatures: where
+    the two are equal there is no direction, and the neighbourhood determines one.
 
     Raises:
-        ValueError: a direction of curvature, and the two are equal everywhere, as on a sphere.
+        ValueError: a direction of curvature, and the principal curvatures are equal everywhere, as on a sphere.
     """
     surface = subject.surface
     if name == "cross":
@@ -40,25 +40,26 @@ def line_fields(subject: Subject, name: str) -> list[Float[Array, "V 3"]]:
         return [X, rotated(surface, X)]
     if name == "rotation":
         middle = (jnp.max(surface.vertices, axis=0) + jnp.min(surface.vertices, axis=0)) / 2
-        # About the vertical, as pictures have it.
+        # The vertical direction of pictures is y.
         axis = jnp.broadcast_to(jnp.asarray([0.0, 1.0, 0.0], surface.dtype), surface.vertices.shape)
         return [tangential(surface, jnp.cross(axis, surface.vertices - middle[None]))]
-    bent = curvature(surface)
-    apart = bent.principal[:, 0] - bent.principal[:, 1]
-    _check_directions(surface, np.asarray(bent.principal), np.asarray(apart), name)
-    guide = tangential(surface, apart[:, None] * bent.directions[:, 0 if name == "largest" else 1])
-    return [direction_field(surface, 2, guide, _SMOOTHING * subject.edge**2)]
+    bend = curvature(surface)
+    difference = bend.principal[:, 0] - bend.principal[:, 1]
+    _check_directions(surface, np.asarray(bend.principal), np.asarray(difference), name)
+    guide = tangential(surface, difference[:, None] * bend.directions[:, 0 if name == "largest" else 1])
+    return [direction_field(surface, 2, guide, _SMOOTHING * subject.mean_edge**2)]
 
 
-def _check_directions(surface: Surface, principal: np.ndarray, apart: np.ndarray, name: str) -> None:
+def _check_directions(surface: Surface, principal: np.ndarray, difference: np.ndarray, name: str) -> None:
     components = np.asarray(surface.topology.components)
-    # That of a sphere of the same area counts where nothing bends.
+    # On a plane the curvature of the sphere of the same area sets the scale.
     scale = np.abs(principal).max() + np.sqrt(4 * np.pi / np.asarray(surface.vertex_areas).sum())
-    of_components = np.zeros(surface.topology.num_components)
-    np.maximum.at(of_components, components, apart)
-    if apart.max() > _EQUAL * scale and (of_components > 0).all():
+    largest_in_component = np.zeros(surface.topology.num_components)
+    np.maximum.at(largest_in_component, components, difference)
+    is_equal = difference.max() <= _EQUAL * scale
+    if not is_equal and (largest_in_component > 0).all():
         return
-    where = "everywhere" if apart.max() <= _EQUAL * scale else f"on all of component {int(np.argmin(of_components))}"
+    where = "everywhere" if is_equal else f"on all of component {int(np.argmin(largest_in_component))}"
     raise ValueError(
         f"There is no direction of {name} curvature: the surface bends alike in all directions {where}, as a sphere or "
         "a plane does. Choose another field, such as --field cross."
@@ -66,31 +67,32 @@ def _check_directions(surface: Surface, principal: np.ndarray, apart: np.ndarray
 
 
 def combed(surface: Surface, X: np.ndarray) -> Float[Array, "V 3"]:
-    """One arm of every cross, chosen so that neighbours agree but for the sign, except along cuts.
+    """One arm of every cross, chosen so that neighbouring arms are parallel except along cuts.
 
-    Along the edges of a spanning tree each vertex takes the arm nearest to that of the one before.
+    From vertex to vertex along a spanning tree of the edges, the arm nearest to the previous one is taken.
     """
-    normals, faces, count = np.asarray(surface.normals, np.float64), np.asarray(surface.faces), len(X)
+    normals, faces, num_vertices = np.asarray(surface.normals, np.float64), np.asarray(surface.faces), len(X)
     X = np.asarray(X, np.float64)
     arms = [X, np.cross(normals, X)]
 
-    def angle(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """From the arm at j to that at i, in right angles."""
-        carried = transport(normals[i], normals[j], X[i])
-        cosine, sine = (np.sum(carried * arm[j], axis=1) for arm in arms)
+    def quarter_turns(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """The angle from the arm at j to the arm at i, in right angles."""
+        transported = transport(normals[i], normals[j], X[i])
+        cosine, sine = (np.sum(transported * arm[j], axis=1) for arm in arms)
         return np.arctan2(sine, cosine) / (np.pi / 2)
 
     i, j = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    # Of all trees that along which neighbours differ the least: a cut goes where they differ most.
-    apart = np.abs(angle(i, j) - np.round(angle(i, j))) + 1e-9
-    tree = csgraph.minimum_spanning_tree(sparse.csr_matrix((apart, (i, j)), shape=(count, count)))
-    _, part = csgraph.connected_components(tree, directed=False)
-    turns = np.zeros(count, np.int64)
-    for root in np.unique(part, return_index=True)[1]:
-        order, before = csgraph.breadth_first_order(tree, root, directed=False)
-        later = order[1:]
-        previous = before[later]
-        more = np.round(angle(previous, later)).astype(np.int64)
-        for vertex, where, turn in zip(later.tolist(), previous.tolist(), more.tolist(), strict=True):
-            turns[vertex] = turns[where] + turn
+    # The minimum spanning tree follows edges along which the crosses differ least, so that cuts lie where they differ.
+    mismatch = np.abs(quarter_turns(i, j) - np.round(quarter_turns(i, j))) + 1e-9
+    shape = (num_vertices, num_vertices)
+    tree = csgraph.minimum_spanning_tree(sparse.csr_matrix((mismatch, (i, j)), shape=shape))
+    _, component = csgraph.connected_components(tree, directed=False)
+    turns = np.zeros(num_vertices, np.int64)
+    for root in np.unique(component, return_index=True)[1]:
+        order, predecessors = csgraph.breadth_first_order(tree, root, directed=False)
+        vertices = order[1:]
+        parents = predecessors[vertices]
+        increments = np.round(quarter_turns(parents, vertices)).astype(np.int64)
+        for vertex, parent, increment in zip(vertices.tolist(), parents.tolist(), increments.tolist(), strict=True):
+            turns[vertex] = turns[parent] + increment
     return jnp.asarray(np.where((turns % 2 == 1)[:, None], arms[1], X), surface.dtype)

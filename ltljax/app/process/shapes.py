@@ -1,6 +1,6 @@
-"""Smooth a mesh, or show what it is like: lines on it, how it bends, how far it is from a vertex.
+"""Smooth a mesh, or draw its properties: lines of a field, curvature, and distance from a vertex.
 
-What enters: the name of a mesh and what is asked of it. What leaves: numbers on its vertices, and pictures.
+What enters: the name of a mesh and options. What leaves: numbers at its vertices, and pictures.
 """
 
 from collections.abc import Sequence
@@ -14,93 +14,110 @@ from ... import imaging
 from ..._mesh.columns import read_colors
 from ..._operators import curvature as curvature_of
 from ..._solve import geodesic_distance
-from .fields import FIELDS, line_fields
+from ..choices import LINE_FIELDS, SMOOTHING_METHODS
+from .fields import line_fields
 from .results import Results, symmetric, usual
 from .subject import Subject, check_choice, check_positive, load
 
-SMOOTHINGS = ("flow", "fair", "features")
-# What is smoothed where nothing is said, in squared edge lengths: waves of an edge or two go.
+# The options of each way to smooth, and their defaults. Times and strengths of None are multiples of the squared mean
+# edge length, at which waves of an edge or two disappear.
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "mean-curvature-flow": dict(time=None, steps=10, keep_volume=False),
+    "fair": dict(strength=None, keep_volume=False),
+    "filter-normals": dict(strength=0.35, steps=5),
+}
 _TIME, _STRENGTH = 0.25, 0.5
-# From where pictures of lines are taken: both sides, as all others.
+# Pictures of lines show both sides, as other pictures do.
 _VIEWS = ((0.55, 0.35, 1.0), (-0.55, 0.35, -1.0))
-# Bands in a picture of distance, at most.
-_BANDS = 24
+# Maximum number of bands in a picture of distance.
+_MOST_BANDS = 24
 
 
 def smooth(
     mesh: str,
     out: Path,
     *,
-    method: str = "flow",
+    method: str = "mean-curvature-flow",
     time: float | None = None,
     strength: float | None = None,
     steps: int | None = None,
     keep_volume: bool = False,
     repair: bool = False,
 ) -> None:
-    """Smooth a mesh, and write it.
+    """Smooth a mesh and write it.
 
     Args:
         mesh: a built-in shape or a mesh file.
-        out: the folder to write to.
-        method: ``"flow"`` (`imaging.mean_curvature_flow`), ``"fair"`` (`imaging.fair`) or ``"features"``
-            (`imaging.filter_normals`), which keeps edges.
-        time: of the flow, in units of a length squared; by default a quarter of the squared mean edge length.
-        strength: of ``fair``, in units of a length squared, by default half the squared mean edge length; of
-            ``features``, how far apart normals may be and still count as the same, by default 0.35.
-        steps: of the flow, by default 10; of ``features``, rounds of the filter, by default 5.
-        keep_volume: whether each component keeps its volume; not of ``features``, which changes it little.
-        repair: mend a mesh file that is not acceptable.
+        out: folder for the results.
+        method: ``"mean-curvature-flow"`` (`imaging.mean_curvature_flow`), ``"fair"`` (`imaging.fair`) or
+            ``"filter-normals"`` (`imaging.filter_normals`), which keeps edges.
+        time: duration of the flow, in units of length squared; by default a quarter of the squared mean edge length.
+        strength: for ``"fair"`` in units of length squared, by default half the squared mean edge length; for
+            ``"filter-normals"`` the difference between unit normals below which they are averaged, by default 0.35.
+        steps: number of steps of the flow, by default 10; for ``"filter-normals"`` the number of iterations of the
+            filter, by default 5.
+        keep_volume: whether to keep the volume of each component; ``"filter-normals"`` changes it little, and does not
+            take this option.
+        repair: whether to repair a mesh file with defects.
 
     Raises:
-        ValueError: the mesh is not acceptable, or the method does not take what is given.
-        SolveError: a step could not be solved, as where the surface collapses.
+        ValueError: the mesh is not acceptable, or an option does not belong to the method.
+        SolveError: a step could not be solved, for example because the surface collapses.
     """
-    check_choice("method", method, SMOOTHINGS)
+    check_choice("method", method, SMOOTHING_METHODS)
     check_positive(time=time, strength=strength, steps=steps)
-    takes = dict(
-        flow=("time", "steps", "keep_volume"), fair=("strength", "keep_volume"), features=("strength", "steps")
-    )
-    given = dict(time=time, strength=strength, steps=steps, keep_volume=keep_volume or None)
-    for name, value in given.items():
-        if value is not None and name not in takes[method]:
-            flags = ", ".join(f"--{flag.replace('_', '-')}" for flag in takes[method])
+    options = dict(time=time, strength=strength, steps=steps, keep_volume=keep_volume or None)
+    for name, value in options.items():
+        if value is not None and name not in _OPTIONS[method]:
+            flags = ", ".join(f"--{option.replace('_', '-')}" for option in _OPTIONS[method])
             raise ValueError(f"--{name.replace('_', '-')} does not belong to --method {method}, which takes {flags}.")
     subject = load(mesh, repair)
     results = Results("smooth", subject, out, ("before", "after"))
-    surface, square = subject.surface, subject.edge**2
-    how: dict[str, Any]
-    if method == "flow":
-        how = dict(time=_TIME * square if time is None else time, steps=10 if steps is None else steps)
-        moved = imaging.mean_curvature_flow(surface, how["time"], how["steps"], keep_volume)
-    elif method == "fair":
-        how = dict(strength=_STRENGTH * square if strength is None else strength)
-        moved = imaging.fair(surface, how["strength"], keep_volume=keep_volume)
-    else:
-        how = dict(strength=0.35 if strength is None else strength, steps=5 if steps is None else steps)
-        moved = imaging.filter_normals(surface, how["strength"], normal_iterations=how["steps"])
+    used = _OPTIONS[method] | {name: value for name, value in options.items() if value is not None}
+    moved = _smoothed(subject, method, used)
+    measured = {name: value for name, value in used.items() if name != "keep_volume"}
+    measured |= _show_smoothed(results, moved)
+    results.finish(dict(used, method=method, keep_volume=keep_volume, repair=repair), measured)
+
+
+def _smoothed(subject: Subject, method: str, options: dict[str, Any]) -> jnp.ndarray:
+    """The vertices (V, 3) of the smoothed surface. Fills in the options that depend on the mean edge length."""
+    surface, square = subject.surface, subject.mean_edge**2
+    if method == "mean-curvature-flow":
+        options["time"] = _TIME * square if options["time"] is None else options["time"]
+        return imaging.mean_curvature_flow(surface, options["time"], options["steps"], options["keep_volume"])
+    if method == "fair":
+        options["strength"] = _STRENGTH * square if options["strength"] is None else options["strength"]
+        return imaging.fair(surface, options["strength"], keep_volume=options["keep_volume"])
+    return imaging.filter_normals(surface, options["strength"], normal_iterations=options["steps"])
+
+
+def _show_smoothed(results: Results, moved: jnp.ndarray) -> dict[str, Any]:
+    """Prepare the smoothed mesh and its pictures; returns what was measured."""
+    subject, surface = results.subject, results.subject.surface
     after = np.asarray(moved, np.float64) + surface.centre
-    bends = [np.asarray(curvature_of(at).mean) for at in (surface, surface.with_vertices(moved))]
+    bends = [np.asarray(curvature_of(each).mean) for each in (surface, surface.with_vertices(moved))]
     way = np.linalg.norm(np.asarray(moved - surface.vertices), axis=1)
     results.numbers({"mean_before": bends[0], "mean_after": bends[1], "way": way}, after)
-    kind = subject.path.suffix.lower() if subject.path else ".ply"
-    own = read_colors(subject.path) if subject.path else None
-    own = None if own is None else np.clip(subject.pulled(own, subject.name), 0, 1)
-    if kind == ".obj":
-        results.shape(after, own)
+    colors = read_colors(subject.path) if subject.path else None
+    colors = None if colors is None else np.clip(subject.from_file_order(colors, subject.name), 0, 1)
+    if subject.path and subject.path.suffix.lower() == ".obj":
+        results.shape(after, colors)
     else:
         grey = np.full((len(after), 3), 200, np.uint8)
-        results.colors(grey if own is None else np.round(255 * own).astype(np.uint8), after)
-    # The noise of the mesh before bends far more than its shape does.
+        results.colors(grey if colors is None else np.round(255 * colors).astype(np.uint8), after)
+    # The limits are those of the smoothed mesh, since noise bends a surface far more than its shape does.
     limits = symmetric(bends[1])
-    for name, values, at in (("before", bends[0], None), ("after", bends[1], after)):
-        results.picture(name, values, "mean curvature", limits, "coolwarm", at)
-    measured: dict[str, Any] = how | dict(largest_way=float(way.max()), mean_way=float(way.mean()))
-    measured |= dict(area_before=subject.mesh.area, area_after=_area(after, subject.mesh.faces))
+    for name, bend, vertices in (("before", bends[0], None), ("after", bends[1], after)):
+        results.picture(name, bend, "mean curvature", limits, "coolwarm", vertices)
+    measured: dict[str, Any] = dict(
+        largest_way=float(way.max()), mean_way=float(way.mean()), area_before=subject.mesh.area,
+        area_after=_area(after, subject.mesh.faces),
+    )  # fmt: skip
     if subject.mesh.is_closed:
-        for name, at in (("before", surface.vertices), ("after", moved)):
-            measured[f"volume_{name}"] = float(imaging.enclosed_volume(at, surface.faces))
-    results.finish(dict(method=method, keep_volume=keep_volume, repair=repair, **how), measured)
+        for name, vertices in (("before", surface.vertices), ("after", moved)):
+            measured[f"volume_{name}"] = float(imaging.enclosed_volume(vertices, surface.faces))
+    return measured
 
 
 def lic(mesh: str, out: Path, *, field: str = "smallest", resolution: int = 600, repair: bool = False) -> None:
@@ -108,23 +125,24 @@ def lic(mesh: str, out: Path, *, field: str = "smallest", resolution: int = 600,
 
     Args:
         mesh: a built-in shape or a mesh file.
-        out: the folder to write to.
-        field: one of `fields.FIELDS`.
-        resolution: pixels of the height of the picture.
-        repair: mend a mesh file that is not acceptable.
+        out: folder for the results.
+        field: the directions of ``"smallest"`` or ``"largest"`` curvature, ``"cross"`` for a smooth field of crosses,
+            or ``"rotation"`` about the vertical axis.
+        resolution: height of the picture in pixels.
+        repair: whether to repair a mesh file with defects.
 
     Raises:
         ValueError: the mesh is not acceptable, there is no such field, or it has no direction on this mesh.
     """
-    check_choice("field", field, FIELDS)
+    check_choice("field", field, LINE_FIELDS)
     subject = load(mesh, repair)
     results = Results("lic", subject, out, ("",))
     surface, is_directed = subject.surface, field == "rotation"
     fields = line_fields(subject, field)
     lines = [imaging.line_integral_convolution(surface, X, is_directed=is_directed) for X in fields]
     grey = np.mean([np.asarray(line) for line in lines], axis=0)
-    named = {"direction" + "_across" * index: X for index, X in enumerate(fields)}
-    results.numbers({**named, "lic": grey})
+    directions = {"direction" + "_across" * index: X for index, X in enumerate(fields)}
+    results.numbers({**directions, "lic": grey})
     from ..._output.colors import vertex_colors
 
     results.colors(vertex_colors(grey, usual(grey), "gray"))
@@ -135,12 +153,12 @@ def lic(mesh: str, out: Path, *, field: str = "smallest", resolution: int = 600,
 
 
 def curvature(mesh: str, out: Path, *, repair: bool = False) -> None:
-    """Draw how a mesh bends: mean and Gauss curvature, ridges and valleys; and write all numbers.
+    """Draw the mean and Gauss curvature, ridges and valleys of a mesh, and write all curvatures.
 
     Args:
         mesh: a built-in shape or a mesh file.
-        out: the folder to write to.
-        repair: mend a mesh file that is not acceptable.
+        out: folder for the results.
+        repair: whether to repair a mesh file with defects.
 
     Raises:
         ValueError: the mesh is not acceptable.
@@ -148,10 +166,10 @@ def curvature(mesh: str, out: Path, *, repair: bool = False) -> None:
     subject = load(mesh, repair)
     surface = subject.surface
     results = Results("curvature", subject, out, ("mean", "gauss", "ridges"))
-    bent, lines = curvature_of(surface), imaging.ridges(surface)
-    mean, gauss, ridge, valley = (np.asarray(x) for x in (bent.mean, bent.gauss, lines.ridge, lines.valley))
-    fields = dict(mean=mean, gauss=gauss, largest=bent.principal[:, 0], smallest=bent.principal[:, 1])
-    fields |= dict(direction_of_largest=bent.directions[:, 0], direction_of_smallest=bent.directions[:, 1])
+    bend, lines = curvature_of(surface), imaging.ridges(surface)
+    mean, gauss, ridge, valley = (np.asarray(x) for x in (bend.mean, bend.gauss, lines.ridge, lines.valley))
+    fields = dict(mean=mean, gauss=gauss, largest=bend.principal[:, 0], smallest=bend.principal[:, 1])
+    fields |= dict(direction_of_largest=bend.directions[:, 0], direction_of_smallest=bend.directions[:, 1])
     fields |= dict(ridge=ridge, valley=valley, shape_index=imaging.shape_index(surface))
     results.numbers(fields)
     from ..._output.colors import vertex_colors
@@ -169,35 +187,36 @@ def distance(mesh: str, out: Path, *, sources: Sequence[int], repair: bool = Fal
 
     Args:
         mesh: a built-in shape or a mesh file.
-        out: the folder to write to.
-        sources: vertices, as the file numbers them, from 0.
-        repair: mend a mesh file that is not acceptable.
+        out: folder for the results.
+        sources: vertices, counted from 0 in the order of the file.
+        repair: whether to repair a mesh file with defects.
 
     Raises:
         ValueError: the mesh is not acceptable or has no such vertex.
     """
     subject = load(mesh, repair)
     results = Results("distance", subject, out, ("",))
-    far = np.asarray(geodesic_distance(subject.surface, subject.vertices_of_file(list(sources))))
-    # On a component without a source there is none.
-    far = np.where(np.isfinite(far), far, np.nan)
-    most = float(np.nanmax(far))
-    band = _band(most)
-    count = int(np.ceil(most / band))
+    distances = np.asarray(geodesic_distance(subject.surface, subject.vertices_of_file(list(sources))))
+    # A component without a source is out of reach.
+    distances = np.where(np.isfinite(distances), distances, np.nan)
+    largest = float(np.nanmax(distances))
+    width = _band_width(largest)
+    num_bands = int(np.ceil(largest / width))
     from ..._output.colors import striped, vertex_colors
 
-    results.numbers({"distance": far})
-    results.colors(vertex_colors(far, (0.0, most)))
-    results.picture("", far, "distance", (0.0, count * band), striped("viridis", count))
+    results.numbers({"distance": distances})
+    results.colors(vertex_colors(distances, (0.0, largest)))
+    results.picture("", distances, "distance", (0.0, num_bands * width), striped("viridis", num_bands))
+    num_unreached = int(np.isnan(distances).sum())
     results.finish(
         dict(sources=list(sources), repair=repair),
-        dict(largest_distance=most, width_of_a_band=band, vertices_out_of_reach=int(np.isnan(far).sum()) or None),
+        dict(largest_distance=largest, width_of_a_band=width, vertices_out_of_reach=num_unreached or None),
     )
 
 
-def _band(most: float) -> float:
-    """A width of 1, 2 or 5 times a power of ten, of which a length has not too many."""
-    least = most / _BANDS
+def _band_width(largest: float) -> float:
+    """The smallest width of 1, 2 or 5 times a power of ten that makes no more than the maximum number of bands."""
+    least = largest / _MOST_BANDS
     power = 10.0 ** np.floor(np.log10(least))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least))
 
@@ -214,7 +233,7 @@ def _drawn(
     resolution: int,
     is_directed: bool,
 ) -> np.ndarray:
-    """The picture of a field from one side, or the mean of those of several."""
-    how: dict[str, Any] = dict(view=view, resolution=resolution, is_directed=is_directed)
-    drawn = [imaging.lic_picture(subject.surface, X, **how)[0] for X in fields]
-    return np.mean(drawn, axis=0).astype(np.uint8)
+    """The picture of a field from one side; for several fields the mean of their pictures."""
+    options: dict[str, Any] = dict(view=view, resolution=resolution, is_directed=is_directed)
+    pictures = [imaging.lic_picture(subject.surface, X, **options)[0] for X in fields]
+    return np.mean(pictures, axis=0).astype(np.uint8)

@@ -1,27 +1,9 @@
-"""What a person wants to run: a name, options or a file become a `Scenario`, ready to be solved."""
+"""A name or a file becomes a `Scenario`, ready to be solved.
 
-from .observed import Places, Wanted
-from .paper import BUILT_IN, SCENARIOS, SOURCES
-from .reader import ScenarioError, read_text
-from .scenario import Options, Scenario, Settings
-from .written import SCHEMES, VIEWS, library, parse_change, read, templates, title
+`__init__.pyi` lists the names of this package. They are imported when they are first used, so that the command line
+can list scenarios without loading JAX.
+"""
 
-__all__ = [
-    "BUILT_IN",
-    "SCENARIOS",
-    "SCHEMES",
-    "SOURCES",
-    "VIEWS",
-    "Options",
-    "Places",
-    "Scenario",
-    "ScenarioError",
-    "Settings",
-    "Wanted",
-    "library",
-    "parse_change",
-    "read",
-    "read_text",
-    "templates",
-    "title",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,12 +1,14 @@
-"""Formulas that people write into files, as ``"a - u + u^2*v"``: arithmetic that is parsed, never executed as code.
+"""Formulas in scenario files, such as ``"a - u + u^2*v"``: arithmetic that is parsed and never executed as code.
 
-What enters: a text and the names it may use. What leaves: a `Formula`, which computes with jax.numpy. There are
-numbers, names, operators and the functions of one table, and nothing else: no attributes, no indexing, no other calls.
-Numbers are floating point from the start, so no power grows without bound. Length and depth are limited.
+What enters: a text and the names it may use. What leaves: a `Formula`, which computes with jax.numpy.
+
+The text is split into numbers, names and signs, and anything else is refused. Python's `ast` parses them, and only the
+nodes of arithmetic, comparisons and calls of the functions below are accepted. Numbers are floating point from the
+start, so no power grows without bound. Length and depth are limited.
 """
 
+import ast
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterable
@@ -15,19 +17,23 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-_LONGEST = 2000
-_DEEPEST = 60
+from .wording import LONGEST_LIST, cut, did_you_mean
+
+_LONGEST, _DEEPEST = 2000, 60
 _CONSTANTS = {"pi": math.pi, "e": math.e}
-# Integer powers up to this are products, whose derivatives are right at zero and for negative bases.
+# Integer exponents up to this become repeated products, whose derivatives are right at zero and for negative bases.
 _LARGEST_POWER = 64
+_OPERAND = "a number, a name or '('"
+# What ends an operand's operators, outside and inside parentheses.
+_END = ("the end", "')'")
 
 
 class FormulaError(ValueError):
-    """A formula that cannot be read: the message names it, the column, what was found and what is allowed."""
+    """A text that is not a formula. The message gives the column, what was expected and what was found."""
 
 
-def _both(compare: Callable) -> Callable:
-    return lambda a, b: jnp.where(compare(a, b), 1.0, 0.0)
+def _truth(condition: Callable) -> Callable:
+    return lambda *values: jnp.where(condition(*values), 1.0, 0.0)
 
 
 def _smoothstep(low, high, x):
@@ -35,63 +41,39 @@ def _smoothstep(low, high, x):
     return s * s * (3 - 2 * s)
 
 
-# Each function by name, and how many arguments it takes.
+# The number of arguments and the implementation of every function.
 _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     **{name: (1, getattr(jnp, name)) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
     **{name: (1, getattr(jnp, name)) for name in ("abs", "sign", "floor")},
-    "asin": (1, jnp.arcsin),
-    "acos": (1, jnp.arccos),
-    "atan": (1, jnp.arctan),
-    "atan2": (2, jnp.arctan2),
-    "hypot": (2, jnp.hypot),
-    "min": (2, jnp.minimum),
-    "max": (2, jnp.maximum),
-    "mod": (2, jnp.mod),
-    "step": (1, lambda x: jnp.where(x > 0, 1.0, 0.0)),
+    "asin": (1, jnp.arcsin), "acos": (1, jnp.arccos), "atan": (1, jnp.arctan), "atan2": (2, jnp.arctan2),
+    "hypot": (2, jnp.hypot), "min": (2, jnp.minimum), "max": (2, jnp.maximum), "mod": (2, jnp.mod),
+    "step": (1, _truth(lambda x: x > 0)), "clip": (3, jnp.clip), "smoothstep": (3, _smoothstep),
     "where": (3, lambda condition, a, b: jnp.where(condition != 0, a, b)),
-    "clip": (3, jnp.clip),
-    "smoothstep": (3, _smoothstep),
-}
-_BINARY: dict[str, Callable[..., Any]] = {
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
-    "*": lambda a, b: a * b,
-    "/": lambda a, b: a / b,
-    "^": jnp.power,
-    "<": _both(lambda a, b: a < b),
-    "<=": _both(lambda a, b: a <= b),
-    ">": _both(lambda a, b: a > b),
-    ">=": _both(lambda a, b: a >= b),
-    "==": _both(lambda a, b: a == b),
-    "!=": _both(lambda a, b: a != b),
-    "and": _both(lambda a, b: (a != 0) & (b != 0)),
-    "or": _both(lambda a, b: (a != 0) | (b != 0)),
-}
-# What a step of a formula does, by name, and how many of the last values it takes.
-_STEPS: dict[str, tuple[int, Callable[..., Any]]] = {
-    **_FUNCTIONS,
-    **{sign: (2, function) for sign, function in _BINARY.items()},
-    "negative": (1, lambda a: -a),
-    "not": (1, lambda a: jnp.where(a == 0, 1.0, 0.0)),
-}
-# How strongly each operator binds; comparisons do not chain, powers bind to the right.
-_BINDING = {"or": 1, "and": 2, "+": 5, "-": 5, "*": 6, "/": 6, "^": 8}
-_BINDING |= dict.fromkeys(("<", "<=", ">", ">=", "==", "!="), 4)
-_NOT, _NEGATIVE, _COMPARISON = 3, 7, 4
+}  # fmt: skip
+# The same for every operator, by its node type.
+_OPERATORS: dict[type, tuple[int, Callable[..., Any]]] = {
+    ast.Add: (2, lambda a, b: a + b), ast.Sub: (2, lambda a, b: a - b), ast.Mult: (2, lambda a, b: a * b),
+    ast.Div: (2, lambda a, b: a / b), ast.Pow: (2, jnp.power), ast.USub: (1, lambda a: -a), ast.UAdd: (1, lambda a: a),
+    ast.Lt: (2, _truth(lambda a, b: a < b)), ast.LtE: (2, _truth(lambda a, b: a <= b)),
+    ast.Gt: (2, _truth(lambda a, b: a > b)), ast.GtE: (2, _truth(lambda a, b: a >= b)),
+    ast.Eq: (2, _truth(lambda a, b: a == b)), ast.NotEq: (2, _truth(lambda a, b: a != b)),
+    ast.And: (2, _truth(lambda a, b: (a != 0) & (b != 0))), ast.Or: (2, _truth(lambda a, b: (a != 0) | (b != 0))),
+    ast.Not: (1, _truth(lambda a: a == 0)),
+}  # fmt: skip
 _TOKEN = re.compile(
-    r"[ \t]*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
-    r"|(?P<sign>\*\*|<=|>=|==|!=|[-+*/^(),<>]))"
+    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)|(?P<sign>(?:and|or|not)(?![A-Za-z0-9_])"
+    r"|\*\*|<=|>=|==|!=|[-+*/^(),<>])|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<unknown>[^ \t])"
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Formula:
-    """A formula, ready to be evaluated; equal formulas are equal and hash alike.
+    """A formula that can be evaluated. Equal formulas compare equal and have the same hash.
 
     Attributes:
-        text: as it was written.
-        steps: in the order in which they are done: a number or ("name", its name), whose value is kept; ("power", n);
-            or the name of what to do with the last values.
+        text: the formula as it was written.
+        steps: the formula in postfix order: a number; ("name", its name) for the value of a name; ("power", n) for an
+            integer power; or the function or operator that is applied to the last values.
         names: the names it uses, in alphabetical order.
     """
 
@@ -100,45 +82,45 @@ class Formula:
     names: tuple[str, ...]
 
     def __call__(self, /, **values: Array | float) -> Array:
-        """The value, for a number or an array of each name; arrays are combined as NumPy does."""
-        kept: list[Array] = []
+        """The value of the formula, given a number or an array for each name; arrays broadcast as in NumPy."""
+        stack: list[Array] = []
         for step in self.steps:
             match step:
                 case float():
-                    # Weakly typed: a number takes the float type of what it meets.
-                    kept.append(jnp.asarray(step))
+                    # Weakly typed: a number takes the float type of the array it meets.
+                    stack.append(jnp.asarray(step))
                 case ("name", name):
-                    kept.append(jnp.asarray(values[name]))
+                    stack.append(jnp.asarray(values[name]))
                 case ("power", exponent):
-                    kept.append(kept.pop() ** exponent)
+                    stack.append(stack.pop() ** exponent)
                 case _:
-                    count, function = _STEPS[step]
-                    kept[-count:] = [function(*kept[-count:])]
-        return kept[0]
+                    count, function = _FUNCTIONS[step] if isinstance(step, str) else _OPERATORS[step]
+                    stack[-count:] = [function(*stack[-count:])]
+        return stack[0]
 
     def __str__(self) -> str:
         return self.text
 
 
 def parse(text: str, names: Iterable[str] = ()) -> Formula:
-    """The formula of a text.
+    """The formula that a text describes.
 
-    Operators: ``+ - * / ^`` (also ``**``; to the right, and stronger than a sign), ``< <= > >= == !=`` (1 or 0),
+    Operators: ``+ - * / ^`` (also ``**``; right-associative and stronger than a sign), ``< <= > >= == !=`` (1 or 0),
     ``and or not``. Constants: pi, e. Functions: `functions`.
 
     Args:
         text: the formula.
-        names: those it may use.
+        names: the names that it may use.
 
     Raises:
-        FormulaError: it is none.
+        FormulaError: the text is not a formula, is too long or too deep, or uses another name.
     """
-    reader = _Reader(text, tuple(names))
-    reader.expression(0, 0)
-    if reader.kind != "end":
-        raise reader.error("an operator or the end")
-    used = {step[1] for step in reader.steps if isinstance(step, tuple) and step[0] == "name"}
-    return Formula(text, tuple(reader.steps), tuple(sorted(used)))
+    if len(text) > _LONGEST:
+        raise FormulaError(f"Expected a formula of at most {_LONGEST} characters, found {len(text)}.")
+    parser = _Parser(text, tuple(names))
+    parser.visit(parser.tree(), 0)
+    used = {step[1] for step in parser.steps if isinstance(step, tuple) and step[0] == "name"}
+    return Formula(text, tuple(parser.steps), tuple(sorted(used)))
 
 
 def functions() -> tuple[str, ...]:
@@ -146,119 +128,148 @@ def functions() -> tuple[str, ...]:
     return tuple(sorted(_FUNCTIONS))
 
 
-class _Reader:
-    """Precedence climbing: an operator takes what stands at its left, and as much of what follows as binds stronger."""
+class _Parser:
+    """Turns a text into postfix steps by way of Python's syntax tree."""
 
     def __init__(self, text: str, names: tuple[str, ...]):
-        self.text, self.known, self.end = text, names, 0
+        self.text, self.names = text, names
+        self.tokens = list(_TOKEN.finditer(text))
+        self.columns: list[int] = []
         self.steps: list[Any] = []
-        if len(text) > _LONGEST:
-            raise FormulaError(f"Expected a formula of at most {_LONGEST} characters, found {len(text)}.")
-        self.next()
 
-    def next(self) -> None:
-        """Read one token; ``start`` is where it begins."""
-        rest = self.text[self.end :]
-        found = _TOKEN.match(self.text, self.end)
-        if found is None and rest.strip(" \t"):
-            self.start = self.end + len(rest) - len(rest.lstrip(" \t"))
-            self.kind, self.word = "unknown", self.text[self.start]
-            raise self.error("a number, a name, an operator or a parenthesis")
-        if found is None:
-            self.kind, self.word, self.start = "end", "", len(self.text)
+    def tree(self) -> ast.expr:
+        """Python's syntax tree of the formula. Names become n0, n1, ..., since they may be keywords of Python."""
+        source, depth, follows_operand = "", 0, False
+        for index, token in enumerate(self.tokens):
+            word, kind = token[0], str(token.lastgroup)
+            self.check(index, depth, follows_operand)
+            depth += (word == "(") - (word == ")")
+            follows_operand = kind != "sign" or word == ")"
+            self.columns.append(len(source))
+            number = repr(float(word)) if kind == "number" else ""
+            source += {"number": number, "name": f"n{index}", "sign": word.replace("^", "**")}[kind] + " "
+        try:
+            return ast.parse(source.strip(), mode="eval").body
+        except SyntaxError:  # All other mistakes of syntax are found by `check`: the text ends too early.
+            end = f"an operator or {_END[depth > 0]}"
+            raise self.error(len(self.tokens), end if follows_operand else _OPERAND) from None
+        except (RecursionError, MemoryError):
+            raise self.too_deep(0) from None
+
+    def check(self, index: int, depth: int, follows_operand: bool) -> None:
+        """Raise if a token cannot follow those before it, at some depth of parentheses."""
+        word, kind = self.tokens[index][0], self.tokens[index].lastgroup
+        previous = self.tokens[index - 1] if index else None
+        is_call = word == "(" and previous is not None and previous.lastgroup == "name"
+        if kind == "unknown":
+            raise self.error(index, "a number, a name, an operator or a parenthesis")
+        if kind == "number" and math.isinf(float(word)):
+            raise self.error(index, "a number of at most 1e308")
+        if kind == "name" and not follows_operand:
+            self.check_name(index)
+        if word == "(" and depth >= _DEEPEST:
+            raise self.too_deep(index)
+        begins_operand = kind != "sign" or word in ("not", "(")
+        if follows_operand and not is_call and (begins_operand or (word == ")" and not depth)):
+            raise self.error(index, f"an operator or {_END[depth > 0]}")
+        if word == "not" and previous is not None and previous[0] not in ("(", ",", "and", "or", "not"):
+            raise self.error(index, "'(' before 'not'")
+        if not follows_operand and kind == "sign" and word not in ("-", "+", "not", "("):
+            raise self.error(index, _OPERAND)
+
+    def check_name(self, index: int) -> None:
+        """Raise if a name is neither known nor a constant, or is called and not a function."""
+        word = self.tokens[index][0]
+        if index + 1 < len(self.tokens) and self.tokens[index + 1][0] == "(":
+            if word not in _FUNCTIONS:
+                raise self.error(index, f"a function ({', '.join(functions())}){did_you_mean(word, _FUNCTIONS)}")
             return
-        self.kind, self.word = str(found.lastgroup), found[str(found.lastgroup)]
-        self.start, self.end = found.start(self.kind), found.end()
-        if self.word in ("and", "or", "not"):
-            self.kind = "sign"
-        self.word = "^" if self.word == "**" else self.word
+        allowed = (*self.names, *_CONSTANTS)
+        if word not in allowed:
+            hint = did_you_mean(word, (*allowed, *_FUNCTIONS))
+            raise self.error(index, f"one of {cut(', '.join(allowed), LONGEST_LIST)}{hint}")
 
-    def error(self, expected: str) -> FormulaError:
-        """The mistake at the token that was read last."""
-        found = "the end" if self.kind == "end" else repr(cut(self.word, 40))
-        return FormulaError(f'"{cut(self.text, 80)}", column {self.start + 1}: expected {expected}, found {found}.')
-
-    def expression(self, weakest: int, depth: int) -> None:
-        """Read operators that bind more strongly than the weakest, and what they join."""
+    def visit(self, node: Any, depth: int) -> None:
+        """Append the steps of a node."""
         if depth > _DEEPEST:
-            raise self.error(f"at most {_DEEPEST} levels of parentheses and signs")
-        self.operand(depth)
-        while self.kind == "sign" and _BINDING.get(self.word, 0) > weakest:
-            operator, binding = self.word, _BINDING[self.word]
-            self.next()
-            self.expression(binding - (operator == "^"), depth + 1)
-            last = self.steps[-1]
-            if operator == "^" and isinstance(last, float) and abs(last) <= _LARGEST_POWER and last == int(last):
-                self.steps[-1] = ("power", int(last))
+            raise self.too_deep(self.token_at(node.col_offset))
+        match node:
+            case ast.Constant(value=float(value)):
+                self.steps.append(value)
+            case ast.Name():
+                word = self.tokens[self.token_at(node.col_offset)][0]
+                self.steps.append(("name", word) if word in self.names else _CONSTANTS[word])
+            case ast.Call(func=ast.Name()):
+                self.call(node, depth)
+            case ast.UnaryOp(op=operator, operand=operand):
+                self.visit(operand, depth + 1)
+                if isinstance(operator, ast.USub) and isinstance(self.steps[-1], float):
+                    self.steps[-1] = -self.steps[-1]
+                else:
+                    self.steps.append(type(operator))
+            case ast.BinOp():
+                self.binary(node, depth)
+            case ast.BoolOp(op=operator, values=[first, *others]):
+                self.visit(first, depth + 1)
+                for other in others:
+                    self.visit(other, depth + 1)
+                    self.steps.append(type(operator))
+            case ast.Compare(left=first, ops=[operator], comparators=[second]):
+                self.visit(first, depth + 1)
+                self.visit(second, depth + 1)
+                self.steps.append(type(operator))
+            case ast.Compare(comparators=[second, *_]):
+                raise self.error(self.token_after(second), "'and' between two comparisons")
+            case ast.Tuple(elts=[first, *_]):
+                raise self.error(self.token_after(first), "an operator or the end")
+            case _:
+                raise self.error(self.token_at(node.col_offset), _OPERAND)
+
+    def binary(self, node: ast.BinOp, depth: int) -> None:
+        """Append a sum, product or power. A loop follows the left operands, since sums may be long."""
+        operations: list[ast.BinOp] = []
+        first: ast.expr = node
+        while isinstance(first, ast.BinOp):
+            operations.append(first)
+            first = first.left
+        self.visit(first, depth + 1)
+        for operation in reversed(operations):
+            self.visit(operation.right, depth + 1)
+            exponent = self.steps[-1] if isinstance(operation.op, ast.Pow) else None
+            if isinstance(exponent, float) and abs(exponent) <= _LARGEST_POWER and exponent == int(exponent):
+                self.steps[-1] = ("power", int(exponent))
             else:
-                self.steps.append(operator)
-            if binding == _COMPARISON and _BINDING.get(self.word) == _COMPARISON:
-                raise self.error("'and' between two comparisons")
+                self.steps.append(type(operation.op))
 
-    def operand(self, depth: int) -> None:
-        """Read a number, a name, a call, something in parentheses, or something with a sign."""
-        kind, word = self.kind, self.word
-        if kind == "number":
-            if math.isinf(float(word)):
-                raise self.error("a number of at most 1e308")
-            self.steps.append(float(word))
-            self.next()
-        elif kind == "name":
-            self.name(depth)
-        elif kind == "sign" and word in ("-", "+", "not"):
-            self.next()
-            self.expression(_NOT if word == "not" else _NEGATIVE, depth + 1)
-            if word == "-" and isinstance(self.steps[-1], float):
-                self.steps[-1] = -self.steps[-1]
-            elif word != "+":
-                self.steps.append("negative" if word == "-" else "not")
-        elif kind == "sign" and word == "(":
-            self.next()
-            self.expression(0, depth + 1)
-            self.close("an operator or ')'")
-        else:
-            raise self.error("a number, a name or '('")
-
-    def name(self, depth: int) -> None:
-        """Read a name: one that is known, a constant, or a function with its arguments."""
-        word, is_call = self.word, self.text[self.end :].lstrip(" \t").startswith("(")
-        if is_call and word not in _FUNCTIONS:
-            raise self.error(f"a function ({', '.join(functions())}){_near(word, _FUNCTIONS)}")
-        if is_call:
-            self.next()
-            self.call(word, depth)
-            return
-        if word in self.known:
-            self.steps.append(("name", word))
-        elif word in _CONSTANTS:
-            self.steps.append(_CONSTANTS[word])
-        else:
-            allowed = (*self.known, *_CONSTANTS)
-            raise self.error(f"one of {cut(', '.join(allowed), 400)}{_near(word, (*allowed, *_FUNCTIONS))}")
-        self.next()
-
-    def call(self, word: str, depth: int) -> None:
-        """Read the arguments of a function."""
+    def call(self, node: Any, depth: int) -> None:
+        """Append the arguments of a function and the function."""
+        word = self.tokens[self.token_at(node.col_offset)][0]
         count, _ = _FUNCTIONS[word]
-        taken = f"{count} argument{'s' * (count > 1)} of {word}"
-        self.next()
-        for left in reversed(range(count)):
-            self.expression(0, depth + 1)
-            self.close(f"',' between the {taken}" if left else f"')' after the {taken}", "," if left else ")")
+        for argument in node.args[:count]:
+            self.visit(argument, depth + 1)
+        taken = f"the {count} argument{'s' * (count > 1)} of {word}"
+        if len(node.args) > count:
+            raise self.error(self.token_after(node.args[count - 1]), f"')' after {taken}")
+        if len(node.args) < count:
+            raise self.error(self.token_at(node.end_col_offset - 1), f"',' between {taken}")
         self.steps.append(word)
 
-    def close(self, expected: str, sign: str = ")") -> None:
-        """Go past a sign that must stand here."""
-        if self.kind != "sign" or self.word != sign:
-            raise self.error(expected)
-        self.next()
+    def token_at(self, column: int) -> int:
+        """The index of the token at a column of the source that Python has read."""
+        return sum(start <= column for start in self.columns) - 1
 
+    def token_after(self, node: ast.expr) -> int:
+        """The index of the first token after a node that is not a closing parenthesis."""
+        index = self.token_at((node.end_col_offset or 1) - 1) + 1
+        return next(place for place in range(index, len(self.tokens)) if self.tokens[place][0] != ")")
 
-def cut(text: str, most: int) -> str:
-    """A text as messages show it: its beginning, where it is long."""
-    return text if len(text) <= most else text[: most - 3] + "..."
+    def too_deep(self, index: int) -> FormulaError:
+        """The mistake of a formula that nests too deeply."""
+        return self.error(index, f"at most {_DEEPEST} levels of parentheses and signs")
 
-
-def _near(word: str, allowed: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word[:100], list(allowed), n=1)
-    return f" (did you mean {cut(near[0], 40)}?)" if near else ""
+    def error(self, index: int, expected: str) -> FormulaError:
+        """The mistake at a token, or at the end of the text."""
+        is_end = index >= len(self.tokens)
+        column = len(self.text) if is_end else self.tokens[index].start()
+        word = "the end" if is_end else repr(cut(self.tokens[index][0], 40))
+        return FormulaError(f'"{cut(self.text, 80)}", column {column + 1}: expected {expected}, found {word}.')

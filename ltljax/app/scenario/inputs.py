@@ -1,4 +1,4 @@
-"""Files that a scenario names, by people nobody knows: what they hold is looked at before it is unpacked or followed.
+"""Files that a scenario names, which may come from anybody: their contents are checked before they are unpacked.
 
 What enters: a path. What leaves: arrays, or an error that says what is wrong.
 """
@@ -17,33 +17,35 @@ from ..._mesh.columns import read_columns
 
 
 def check_self_contained(path: Path) -> None:
-    """Raise where a mesh file names others: it could name any, and a copy of it would lack them."""
-    named: list[Any] = []
+    """Raise if a mesh file refers to other files: it could refer to any file, and a copy of it would be incomplete."""
+    references: list[Any] = []
     try:
         if path.suffix.lower() == ".gii":
             parser = expat.ParserCreate()
-            parser.StartElementHandler = lambda _, values: named.append(values.get("ExternalFileName"))
+            parser.StartElementHandler = lambda _, values: references.append(values.get("ExternalFileName"))
             parser.Parse(path.read_bytes(), True)
         elif path.suffix.lower() in (".gltf", ".glb"):
             data = path.read_bytes()
             text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
-            named += [buffer.get("uri") for buffer in json.loads(text)["buffers"]]
+            references += [buffer.get("uri") for buffer in json.loads(text)["buffers"]]
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, expat.ExpatError):
-        pass  # damaged: reading it says how
-    for other in named:
-        if other and not str(other).startswith("data:"):
+        pass  # The file is damaged, which is reported when it is read.
+    for reference in references:
+        if reference and not str(reference).startswith("data:"):
             raise MeshError(
                 f"{path.name}: expected a file that holds all of its data, found one that refers to "
-                f"{str(other)[:60]!r}. Export it in one file, such as GLB, OBJ or PLY."
+                f"{str(reference)[:60]!r}. Export it as one file, such as GLB, OBJ or PLY."
             )
 
 
 def arrays(path: Path, names: tuple[str, ...], size: int) -> list[np.ndarray]:
-    """The columns (V,) of a CSV file, or the arrays of an .npz file, whose heads are read before they are unpacked.
+    """The columns (V,) of a CSV file, or the arrays of an .npz file, whose headers are checked before unpacking.
 
     Source: numpy.lib.format.
+
+    Raises:
+        ValueError: a column is absent, or has another size or type.
     """
-    columns = []
     if path.suffix.lower() == ".csv":
         table = read_columns(path)
         if absent := [name for name in names if name not in table]:
@@ -52,7 +54,8 @@ def arrays(path: Path, names: tuple[str, ...], size: int) -> list[np.ndarray]:
         if len(columns[0]) != size:
             raise ValueError(f"expected {size} rows of numbers, found {len(columns[0])}")
         return columns
-    # Of sixteen bytes an entry at most, and a head.
+    columns = []
+    # A number has at most sixteen bytes, and the header is short.
     longest = 16 * size + 4096
     with zipfile.ZipFile(path) as archive:
         for name in names:

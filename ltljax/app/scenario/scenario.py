@@ -1,7 +1,6 @@
-"""What a run is made of, and what a user can choose about it."""
+"""A scenario: everything that a run needs."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,9 +8,15 @@ from typing import Any
 import diffrax
 import numpy as np
 
+from ..._base.progress import noted
 from ..._equations import Equation
+from ..._lifting.schemes import Monotone, Paper, Polynomial, Scheme
 from ..._mesh import Mesh
-from .observed import Wanted
+from ..._surface import FarFromOriginWarning, Surface
+from .measurements import FitTask
+
+# Number of vertices above which a progress bar is shown while the surface is built.
+_LARGE_MESH = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,18 +25,17 @@ class Settings:
 
     Attributes:
         scheme: ``"monotone"``, ``"polynomial"`` or ``"paper"``.
-        degree: of the scheme ``"polynomial"``.
+        degree: degree of the scheme ``"polynomial"``; None for the other schemes.
         dtype: ``"float32"`` or ``"float64"``.
-        solver: as of `solve`; None for its default.
+        solver: solver for `solve`; None for the default of `solve`.
         rtol: relative tolerance.
-        atol: absolute tolerance; None for what `solve` takes by itself.
-        dt: the length of fixed steps; None for adaptive ones.
-        show: the species that pictures show.
-        colormap: the name of their colours.
-        view: from where pictures look, one of `ltljax._output.pictures.VIEWS`.
-        texture: pixels of an edge of the image that the mesh's UV map leads to.
-        displacement: how far the largest value of ``show`` is raised above the least in a surface written for that;
-            zero for none.
+        atol: absolute tolerance; None for the default of `solve`.
+        dt: length of fixed steps; None for adaptive steps.
+        show: species that pictures show.
+        colormap: name of the colour map of pictures.
+        view: side from which pictures are taken, one of `ltljax._output.pictures.VIEWS`.
+        texture: width and height of the texture in pixels, if the mesh has a UV map.
+        displacement: height of the relief of ``show``, which is written as a further surface; zero for none.
     """
 
     scheme: str = "monotone"
@@ -47,79 +51,66 @@ class Settings:
     texture: int = 1024
     displacement: float = 0.0
 
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """What a user can choose about a scenario.
-
-    Attributes:
-        mesh: one of `BUILT_IN` or the path of a mesh file.
-        source: of `heat` on the torus, one of `SOURCES`.
-        boundary: of `heat` on an open mesh, conditions as `parse_condition` reads them.
-        as_published: of `turing`, the paper's parameters in place of those that make a pattern.
-        keep_scale: leave a mesh file's length scale alone.
-        repair: mend a mesh file that is not acceptable.
-        seed: of the random numbers.
-        t1: the end of the run; None for the scenario's own.
-        scale: of `turing`, how many times as large its pattern is.
-    """
-
-    mesh: str = "sphere"
-    source: str | None = None
-    boundary: tuple[str, ...] = ()
-    as_published: bool = False
-    keep_scale: bool = False
-    repair: bool = False
-    seed: int = 0
-    t1: float | None = None
-    scale: float = 1.0
+    def make_scheme(self) -> Scheme:
+        """The scheme of the operators."""
+        if self.scheme == "polynomial":
+            return Polynomial(self.degree or 4)
+        return Paper() if self.scheme == "paper" else Monotone()
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """An example, ready to be solved.
+    """A mesh, an equation on it, an initial state, and how to solve and show it.
 
     Attributes:
-        name: its name.
-        mesh: where; for files scaled as ``notes`` says.
-        make_equation: the equation, from the surface of the mesh; with a second argument, numbers by dotted key that
-            replace those of a scenario file.
-        u0: the initial state.
-        t1: the end of the run.
-        parameters: every parameter, for the record.
-        species: the names of the state's columns.
-        shown: the column that pictures show.
-        exact: ``t -> state``, where the solution is known.
-        exact_is: what ``exact`` is, in words.
+        name: name of the scenario, with which the names of its results begin.
+        title: title of the scenario.
+        mesh: mesh; a mesh file is scaled as ``notes`` says.
+        make_equation: ``surface -> equation``; a second argument, a dictionary with dotted keys, replaces numbers of
+            the scenario file.
+        u0: (V, S) initial state.
+        t1: end time of the run.
+        frames: number of states that are recorded after the initial one, unless the command line changes it.
+        species: names of the columns of the state.
+        settings: how the scenario is solved and shown.
+        tables: every value of the scenario file, defaults included.
+        files: files that the scenario file names, by dotted key.
+        exact: ``t -> state`` (V, S), where the solution is known.
+        exact_is: exact solution in words.
         notes: what a reader of the results should know.
-        title: what it is called in words.
-        frames: how many states are kept besides the first, unless the command line says otherwise.
-        settings: how it is solved and shown.
-        resolved: of a scenario file, all its tables with every value, defaults too.
-        files: of a scenario file, the files it names, by the dotted key that does.
-        wanted: of a scenario file with a table ``[fit]``, what is to be found from what was seen.
+        fit_task: unknowns and measurements of the table ``[fit]``; None if the file has no such table.
     """
 
     name: str
+    title: str
     mesh: Mesh
     make_equation: Callable[..., Equation]
     u0: np.ndarray
     t1: float
-    parameters: dict[str, Any]
+    frames: int
     species: tuple[str, ...]
-    shown: int = 0
+    settings: Settings
+    tables: dict[str, Any]
+    files: Mapping[str, Path]
     exact: Callable[[float], np.ndarray] | None = None
     exact_is: str = ""
     notes: tuple[str, ...] = ()
-    title: str = ""
-    frames: int = 60
-    settings: Settings = Settings()
-    resolved: dict[str, Any] | None = None
-    files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    wanted: Wanted | None = None
+    fit_task: FitTask | None = None
 
+    def make_surface(self) -> Surface:
+        """The surface of the mesh, with a progress bar if building it takes long."""
+        is_large = self.mesh.num_vertices > _LARGE_MESH
+        # Results are written at the positions of the mesh, whatever the origin of the surface.
+        with noted(FarFromOriginWarning):
+            return Surface.from_mesh(self.mesh, self.settings.make_scheme(), self.settings.dtype, progress=is_large)
 
-def scaled_to_unit_area(mesh: Mesh) -> tuple[Mesh, str]:
-    """The mesh with the area of the unit sphere, and a note that says so."""
-    factor = math.sqrt(4 * math.pi / mesh.area)
-    return mesh.scaled(factor), f"The mesh is scaled by {factor:.6g}, so that its area is that of the unit sphere."
+    @property
+    def shown(self) -> int:
+        """The column of the state that pictures show."""
+        return self.species.index(self.settings.show)
+
+    @property
+    def where(self) -> str:
+        """The mesh in one word: the name of its file or its shape."""
+        mesh = self.tables["mesh"]
+        return mesh.get("file") or mesh["shape"]

@@ -1,6 +1,5 @@
-"""Reads tables of a scenario file: a mistake is named by file, key, what was found and what is allowed."""
+"""Reads the tables of a scenario file. Errors name the file, the key, what was expected and what was found."""
 
-import difflib
 import math
 import re
 import tomllib
@@ -8,28 +7,29 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
-from .formulas import Formula, FormulaError, cut, parse
+from .formulas import Formula, FormulaError, parse
+from .wording import cut, did_you_mean, listed
 
-# More than any scenario needs; what is larger is not one.
+# Far more than any scenario needs.
 _LARGEST_FILE = 1_000_000
 _DEEPEST = 8
-# A key of many parts takes the parser time in proportion to the square of their number, whose depth is seen only after.
+# The TOML parser takes time quadratic in the number of parts of a key, so long keys are refused before it runs.
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{4 * _DEEPEST}}}")
-# Longer names and lists of names are not spelled out in messages.
-_LONGEST_NAME, _LONGEST_LIST = 40, 400
+# Longer keys are cut in messages.
+_LONGEST_NAME = 40
 
 
 class ScenarioError(ValueError):
-    """A scenario file that does not say what to do."""
+    """A scenario file with a mistake."""
 
 
 def read_text(path: Path) -> str:
     """The text of a scenario file.
 
     Raises:
-        ScenarioError: it is no regular file, too long, or not in UTF-8.
-        OSError: it cannot be read.
+        ScenarioError: the path is not a regular file, or the file is too long or not in UTF-8.
+        OSError: the file cannot be read.
     """
     if path.exists() and not path.is_file():
         raise ScenarioError(f"{path}: expected a file, found a folder or a device.")
@@ -41,20 +41,20 @@ def read_text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
-        found = f"the byte 0x{data[error.start]:02x} in line {line}"
-        raise ScenarioError(f"{path}: expected text in UTF-8, found {found}. Save it as UTF-8.") from None
+        byte = f"the byte 0x{data[error.start]:02x} in line {line}"
+        raise ScenarioError(f"{path}: expected text in UTF-8, found {byte}. Save the file as UTF-8.") from None
 
 
 def load(text: str, name: str) -> dict[str, Any]:
     """The tables of a TOML text.
 
     Raises:
-        ScenarioError: it is too long, or no TOML.
+        ScenarioError: the text is too long, nests too deeply, or is not TOML.
     """
     if len(text) > _LARGEST_FILE:
         raise ScenarioError(f"{name}: expected at most {_LARGEST_FILE} characters, found {len(text)}.")
-    if found := _LONG_KEY.search(text):
-        line = text.count("\n", 0, found.start()) + 1
+    if long_key := _LONG_KEY.search(text):
+        line = text.count("\n", 0, long_key.start()) + 1
         raise ScenarioError(f"{name}: expected keys of at most {_DEEPEST} parts, found more in line {line}.")
     try:
         tables = tomllib.loads(text)
@@ -72,12 +72,15 @@ def _depth(value: Any, limit: int = _DEEPEST) -> int:
 
 
 class Table:
-    """One table of a scenario file, from which values are taken by name; what is not taken is a mistake.
+    """One table of a scenario file. Values are taken from it by name, and a value that nobody takes is a mistake.
 
     Args:
         values: the table.
-        file: the name of the file, for messages.
-        path: the table's own name, for messages.
+        file: name of the file, for messages.
+        path: dotted name of the table, for messages.
+
+    Attributes:
+        taken: the values taken so far, defaults included.
     """
 
     def __init__(self, values: Any, file: str, path: str = ""):
@@ -91,47 +94,54 @@ class Table:
         return key in self._values
 
     def names(self) -> list[str]:
-        """The keys that are left."""
+        """The keys that have not been taken yet."""
         return [key for key in self._values if key not in self.taken]
 
+    def name(self, key: str) -> str:
+        """A key with those of the tables around it, such as ``kinetics.feed``; cut if it is very long."""
+        short = cut(key, _LONGEST_NAME)
+        return f"{self._path}.{short}" if self._path else short
+
     def error(self, key: str, expected: str) -> ScenarioError:
-        """The mistake that the value of a key is."""
+        """The error for a key whose value is not what was expected."""
         return ScenarioError(
             f"{self._file}: expected {expected} as {self.name(key)}, found {_shown(self._values.get(key))}."
         )
 
     def refused(self, key: str, reason: object) -> ScenarioError:
-        """The mistake that the value of a key is, as another room has put it."""
+        """The error for a key whose value is refused for a reason that stands for itself."""
         return ScenarioError(f"{self._file}: {self.name(key)}: {reason}")
 
     def table(self, key: str) -> "Table":
-        """A table inside; empty where there is none."""
+        """A table inside this one; an empty table if there is none."""
         inner = Table(self._values.get(key, {}), self._file, self.name(key))
         self.taken[key] = inner.taken
         return inner
 
     def tables(self, key: str) -> list["Table"]:
-        """The tables of a list of tables; none by default."""
+        """The tables of a list of tables; empty by default."""
         value = self._values.get(key, [])
         if not isinstance(value, list):
             raise self.error(key, f"a list of tables, [[{self.name(key)}]],")
         inner = [Table(entry, self._file, self.name(key)) for entry in value]
-        self.taken[key] = [one.taken for one in inner]
+        self.taken[key] = [table.taken for table in inner]
         return inner
 
     def number(self, key: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
-        """A finite number."""
+        """A finite number within bounds."""
         value = self._values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not _is_within(value, least, most):
-            bounds = f" from {least:g} to {most:g}" if math.isfinite(least + most) else ""
-            bounds = bounds or (f" of at least {least:g}" if math.isfinite(least) else "")
-            # The least number that is not lost counts as zero.
-            bounds = bounds if not 0 < least < 1e-200 else " above 0"
+            if 0 < least < 1e-200:  # a bound that means "positive"
+                bounds = " above 0"
+            elif math.isfinite(least + most):
+                bounds = f" from {least:g} to {most:g}"
+            else:
+                bounds = f" of at least {least:g}" if math.isfinite(least) else ""
             raise self.error(key, f"a number{bounds}")
         return self._take(key, float(value))
 
     def count(self, key: str, default: int, least: int, most: int) -> int:
-        """A whole number."""
+        """A whole number within bounds."""
         value = self._values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
             raise self.error(key, f"a whole number from {least} to {most}")
@@ -145,53 +155,11 @@ class Table:
         return self._take(key, value)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A text on one line."""
+        """A text of one line."""
         value = self._values.get(key, default)
         if not isinstance(value, str) or len(value) > 1000 or not value.isprintable():
             raise self.error(key, "a text")
         return self._take(key, value)
-
-    def peek(self, key: str) -> Any:
-        """What a key holds, unchecked and not counted as used; None where there is none."""
-        return self._values.get(key)
-
-    def choice(self, key: str, allowed: Collection[str], default: str | None = None) -> str:
-        """One of several words."""
-        value = self._values.get(key, default)
-        if not isinstance(value, str) or value not in allowed:
-            raise self.error(key, f"one of {listed(allowed)}{_near(value, allowed)}")
-        return self._take(key, value)
-
-    def formula(self, key: str, names: Iterable[str], default: float | str | None = None) -> Formula:
-        """A number or a formula of the names."""
-        value = self._values.get(key, default)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool) and _is_within(value)
-        if not (is_number or isinstance(value, str)):
-            raise self.error(key, "a number or a formula")
-        try:
-            found = parse(repr(float(value)) if is_number else value, names)  # type: ignore
-        except FormulaError as error:
-            raise self.refused(key, error) from None
-        self._take(key, value)
-        return found
-
-    def formulas(self, key: str, count: int, names: Iterable[str]) -> list[Formula]:
-        """A list of so many formulas."""
-        value = self._values.get(key)
-        if not isinstance(value, list) or len(value) != count:
-            raise self.error(key, f"a list of {count} formulas")
-        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
-        found = [inner.formula(str(index), names) for index in range(count)]
-        self._take(key, value)
-        return found
-
-    def numbers(self, key: str, default: tuple[float, ...], least: float, most: float) -> list[float]:
-        """As many numbers as the default has."""
-        value = self._values.get(key, list(default))
-        if not isinstance(value, list) or len(value) != len(default):
-            raise self.error(key, f"a list of {len(default)} numbers")
-        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
-        return self._take(key, [inner.number(str(index), 0.0, least, most) for index in range(len(default))])
 
     def texts(self, key: str) -> list[str]:
         """A list of texts; empty by default."""
@@ -200,11 +168,53 @@ class Table:
             raise self.error(key, "a list of texts")
         return self._take(key, value)
 
+    def peek(self, key: str) -> Any:
+        """The value of a key, unchecked and not taken; None if there is none."""
+        return self._values.get(key)
+
+    def choice(self, key: str, allowed: Collection[str], default: str | None = None) -> str:
+        """One of several words."""
+        value = self._values.get(key, default)
+        if not isinstance(value, str) or value not in allowed:
+            raise self.error(key, f"one of {listed(allowed)}{did_you_mean(value, allowed)}")
+        return self._take(key, value)
+
+    def formula(self, key: str, names: Iterable[str], default: float | str | None = None) -> Formula:
+        """A number or a formula in some names."""
+        value = self._values.get(key, default)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and _is_within(value)
+        if not (is_number or isinstance(value, str)):
+            raise self.error(key, "a number or a formula")
+        try:
+            formula = parse(repr(float(value)) if is_number else value, names)  # type: ignore
+        except FormulaError as error:
+            raise self.refused(key, error) from None
+        self._take(key, value)
+        return formula
+
+    def formulas(self, key: str, count: int, names: Iterable[str]) -> list[Formula]:
+        """A list of ``count`` numbers or formulas."""
+        value = self._values.get(key)
+        if not isinstance(value, list) or len(value) != count:
+            raise self.error(key, f"a list of {count} formulas")
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
+        formulas = [inner.formula(str(index), names) for index in range(count)]
+        self._take(key, value)
+        return formulas
+
+    def numbers(self, key: str, default: tuple[float, ...], least: float, most: float) -> list[float]:
+        """A list of as many numbers as the default has."""
+        value = self._values.get(key, list(default))
+        if not isinstance(value, list) or len(value) != len(default):
+            raise self.error(key, f"a list of {len(default)} numbers")
+        inner = Table({str(index): entry for index, entry in enumerate(value)}, self._file, self.name(key))
+        return self._take(key, [inner.number(str(index), 0.0, least, most) for index in range(len(default))])
+
     def file(self, key: str, folder: Path) -> Path:
-        """A file in the folder of the scenario, or below.
+        """A file in the folder of the scenario, or below it.
 
         Raises:
-            ScenarioError: it leads out of that folder, or does not exist.
+            ScenarioError: the path leads out of the folder, or there is no such file.
         """
         value = self.text(key)
         inside = folder.resolve()
@@ -214,28 +224,24 @@ class Table:
         except (OSError, ValueError, RuntimeError):
             raise self.error(key, "the name of a file") from None
         if not path.is_relative_to(inside):
-            other = "; from elsewhere name it by --mesh" if self.name(key) == "mesh.file" else ""
+            other = "; give a mesh from elsewhere by --mesh" if self.name(key) == "mesh.file" else ""
             raise self.error(key, f"a file in the scenario's own folder, {folder}, or below it{other}")
         if not is_file:
             raise self.error(key, "the name of a file that exists")
         return path
 
     def finish(self) -> None:
-        """Raise where a key was not taken: nobody would notice that it does nothing."""
+        """Raise if a key was not taken, since it would silently do nothing."""
         for key in self.names():
             allowed = sorted(self.taken)
             raise ScenarioError(
-                f"{self._file}: {self.name(key)} is not known{_near(key, allowed)}. Known here: {listed(allowed)}."
+                f"{self._file}: {self.name(key)} is not known{did_you_mean(key, allowed)}. "
+                f"Known here: {listed(allowed)}."
             )
 
     def _take(self, key: str, value: Any) -> Any:
         self.taken[key] = value
         return value
-
-    def name(self, key: str) -> str:
-        """A key with those of the tables around it, as ``kinetics.feed``; cut where it is very long."""
-        short = cut(key, _LONGEST_NAME)
-        return f"{self._path}.{short}" if self._path else short
 
 
 def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -> bool:
@@ -246,19 +252,9 @@ def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -
     return math.isfinite(number) and least <= number <= most
 
 
-def listed(names: Collection[str]) -> str:
-    """Names with commas between, not all where they are many."""
-    return cut(", ".join(names), _LONGEST_LIST) or "nothing"
-
-
 def _shown(value: Any) -> str:
     try:
         text = "nothing" if value is None else repr(value)
-    except (ValueError, RecursionError):  # a whole number of more digits than Python writes
+    except (ValueError, RecursionError):  # an integer with more digits than Python prints
         text = f"a very large {type(value).__name__}"
     return cut(text, 80)
-
-
-def _near(value: Any, allowed: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(value)[:100], list(allowed), n=1)
-    return f" (did you mean {cut(near[0], 40)}?)" if near else ""
