@@ -1,11 +1,11 @@
-"""Accuracy of the Laplacian of this package beside three others, regular meshes to random ones, with and without a rim.
+"""Accuracy of the Laplacian of this package and of three others on regular to random meshes, open and closed.
 
 python benchmarks/accuracy.py [--refinements 4] [--families icosphere,disk] [--plot accuracy.png] [--json accuracy.json]
 
-On each surface the fields are its lowest 9 to 15 eigenfunctions, so that their Laplacian, gradient, decay by heat and
-the Poisson problem they solve are known; an error is relative to the exact field, and the root of the mean square over
-the fields. The others (libigl, robust-laplacian, LaPy; install ltljax[bench]) enter as -M^-1 S with a lumped mass
-matrix M. On a boundary the normal derivative is zero, for the exact fields and for all operators.
+The fields are the lowest 9 to 15 eigenfunctions of each surface, so that their Laplacian, gradient, heat flow and
+Poisson problem are known. Errors are relative to the exact field, and are root mean squares over the fields. The other
+packages (libigl, robust-laplacian, LaPy; install ltljax[bench]) are used as -M^-1 S with a lumped mass matrix M. On a
+boundary the normal derivative is zero, for the exact fields and for all operators.
 """
 
 import argparse
@@ -29,7 +29,7 @@ import numpy as np  # noqa: E402
 import robust_laplacian  # noqa: E402
 import scipy.linalg  # noqa: E402
 import scipy.sparse  # noqa: E402
-import scipy.special  # noqa: E402
+from exact_modes import FAMILIES  # noqa: E402
 from scipy.sparse.linalg import ArpackNoConvergence, eigs, splu  # noqa: E402
 
 import ltljax as ltl  # noqa: E402
@@ -37,8 +37,8 @@ import ltljax as ltl  # noqa: E402
 TIME = 0.1
 TIME_STEPS = 4
 NUM_EIGENVALUES = 12
-SHIFT = -0.1  # eigenvalues of -Delta are sought near it
-LARGEST_DENSE = 3000  # vertices, for the whole spectrum
+SHIFT = -0.1  # eigenvalues of -Delta are computed near this value
+LARGEST_DENSE = 3000  # vertices; the whole spectrum is computed up to this size
 ROUNDING = 1e-12
 REFERENCE = "robust-laplacian"
 
@@ -57,177 +57,14 @@ ERRORS = ("laplacian_rms", "laplacian_max", "gradient", "heat", "poisson", "eige
 RATIOS = ("laplacian_rms", "laplacian_max", "heat", "poisson", "eigenvalues")
 
 
-# The exact side: eigenfunctions, their gradients, and the spectrum of four surfaces.
-
-
-class Mode(NamedTuple):
-    """An eigenfunction: Delta values = -eigenvalue * values, with its tangent gradient, on the vertices."""
-
-    eigenvalue: float
-    values: np.ndarray
-    gradient: np.ndarray
-
-
-class Family(NamedTuple):
-    """Meshes of one surface, refinement 0 with about 640 vertices and four times as many from one to the next."""
-
-    make: Callable[[int], ltl.Mesh]
-    modes: Callable[[np.ndarray], list[Mode]]
-    spectrum: Callable[[], np.ndarray]
-
-
-# Harmonic polynomials; on the unit sphere their restrictions are all eigenfunctions up to 12 = 3 (3 + 1).
-HARMONICS = {
-    2.0: (lambda x, y, z: x, lambda x, y, z: y, lambda x, y, z: z),
-    6.0: (
-        lambda x, y, z: x * y,
-        lambda x, y, z: y * z,
-        lambda x, y, z: z * x,
-        lambda x, y, z: x**2 - y**2,
-        lambda x, y, z: 2 * z**2 - x**2 - y**2,
-    ),
-    12.0: (
-        lambda x, y, z: x * y * z,
-        lambda x, y, z: x * (x**2 - 3 * y**2),
-        lambda x, y, z: y * (3 * x**2 - y**2),
-        lambda x, y, z: z * (x**2 - y**2),
-        lambda x, y, z: x * (4 * z**2 - x**2 - y**2),
-        lambda x, y, z: y * (4 * z**2 - x**2 - y**2),
-        lambda x, y, z: z * (2 * z**2 - 3 * x**2 - 3 * y**2),
-    ),
-}
-
-
-def sphere_modes(vertices):
-    """Spherical harmonics of degrees 1 to 3."""
-    modes = []
-    for eigenvalue, polynomials in HARMONICS.items():
-        for polynomial in polynomials:
-            gradient = np.stack(jax.vmap(jax.grad(polynomial, argnums=(0, 1, 2)))(*vertices.T), axis=1)
-            gradient -= np.sum(gradient * vertices, axis=1, keepdims=True) * vertices
-            modes.append(Mode(eigenvalue, polynomial(*vertices.T), gradient))
-    return modes
-
-
-def hemisphere_modes(vertices):
-    """Spherical harmonics of degrees 1 to 3, even in z, so that no flux crosses the equator."""
-    mirrored = sphere_modes(vertices * [1, 1, -1])
-    return [
-        mode
-        for mode, mirror in zip(sphere_modes(vertices), mirrored, strict=True)
-        if np.allclose(*(m.values for m in (mode, mirror)))
-    ]
-
-
-def sphere_spectrum():
-    return np.repeat([degree * (degree + 1.0) for degree in range(1, 8)], [2 * degree + 1 for degree in range(1, 8)])
-
-
-def hemisphere_spectrum():
-    return np.repeat([degree * (degree + 1.0) for degree in range(1, 8)], [degree + 1 for degree in range(1, 8)])
-
-
-def disk_modes(vertices):
-    """J_m(k r) times cos(m theta) or sin(m theta), J_m'(k) = 0, so that no flux crosses the rim; all with k^2 <= 30."""
-    r, theta = np.hypot(vertices[:, 0], vertices[:, 1]), np.arctan2(vertices[:, 1], vertices[:, 0])
-    outwards = np.stack([np.cos(theta), np.sin(theta), 0 * theta], axis=1)
-    around = np.stack([-np.sin(theta), np.cos(theta), 0 * theta], axis=1)
-    modes = []
-    for m in range(6):
-        for k in scipy.special.jnp_zeros(m, 3):
-            for wave, slope_of_wave in waves_around(m, theta) if k**2 <= 30 else ():
-                slope = k * scipy.special.jvp(m, k * r) * wave
-                # m J_m(k r) / r is written as k (J_(m-1) + J_(m+1)) / 2, which is finite at the centre.
-                turn = k * (scipy.special.jv(m - 1, k * r) + scipy.special.jv(m + 1, k * r)) / 2 * slope_of_wave
-                modes.append(
-                    Mode(k**2, scipy.special.jv(m, k * r) * wave, slope[:, None] * outwards + turn[:, None] * around)
-                )
-    return modes
-
-
-def waves_around(m, angle):
-    """cos(m angle) and sin(m angle), each with its derivative divided by m."""
-    return [(np.cos(m * angle), -np.sin(m * angle)), (np.sin(m * angle), np.cos(m * angle))][: 2 if m else 1]
-
-
-def disk_spectrum():
-    squares = [np.repeat(scipy.special.jnp_zeros(m, 6) ** 2, 2 if m else 1) for m in range(10)]
-    return np.sort(np.concatenate(squares))
-
-
-MAJOR, MINOR = 2.0, 1.0
-FREQUENCIES = np.fft.fftfreq(65, 1 / 65)
-
-
-@functools.cache
-def torus_profiles(m):
-    """Eigenvalues and Fourier coefficients (N, 65) of the w in eigenfunctions w(p) cos(m q) of the torus.
-
-    -(s w')' / r^2 + m^2 w / s = eigenvalue * s w with s = a + r cos p, by Fourier collocation, exact to rounding.
-    """
-    p = 2 * np.pi * np.arange(len(FREQUENCIES)) / len(FREQUENCIES)
-    s = MAJOR + MINOR * np.cos(p)
-    derive = np.fft.ifft(1j * FREQUENCIES[:, None] * np.fft.fft(np.eye(len(p)), axis=0), axis=0).real
-    stiffness = derive.T @ np.diag(s) @ derive / MINOR**2 + np.diag(m**2 / s)
-    eigenvalues, profiles = scipy.linalg.eigh(stiffness, np.diag(s))
-    profiles = profiles * np.sign(profiles[1]) / np.abs(profiles).max(axis=0)
-    return eigenvalues, np.fft.fft(profiles, axis=0).T / len(p)
-
-
-def torus_modes(vertices):
-    """Eigenfunctions w(p) times cos(m q) or sin(m q), p around the tube and q around the axis; all up to 2.1."""
-    x, y, z = vertices.T
-    p, q = np.arctan2(z, np.hypot(x, y) - MAJOR), np.arctan2(y, x)
-    up = np.stack([-np.sin(p) * np.cos(q), -np.sin(p) * np.sin(q), np.cos(p)], axis=1)
-    around = np.stack([-np.sin(q), np.cos(q), 0 * q], axis=1)
-    waves = np.exp(1j * p[:, None] * FREQUENCIES)
-    modes = []
-    for m in range(4):
-        for eigenvalue, coefficients in zip(*torus_profiles(m), strict=True):
-            if not 1e-8 < eigenvalue <= 2.1:
-                continue
-            w, w_p = (waves @ coefficients).real, (waves @ (1j * FREQUENCIES * coefficients)).real / MINOR
-            for wave, slope_of_wave in waves_around(m, q):
-                turn = m * w * slope_of_wave / (MAJOR + MINOR * np.cos(p))
-                modes.append(Mode(eigenvalue, w * wave, (w_p * wave)[:, None] * up + turn[:, None] * around))
-    return modes
-
-
-def torus_spectrum():
-    values = [np.repeat(torus_profiles(m)[0][:12], 2 if m else 1) for m in range(10)]
-    return np.sort(np.concatenate(values))[1:]  # without the zero of the constants
-
-
-def jittered_hemisphere(refinement):
-    smooth = ltl.shapes.hemisphere(rings=14 * 2**refinement)
-    return ltl.shapes.jittered(smooth, 0.2, seed=0, project=lambda x: x / np.linalg.norm(x, axis=1, keepdims=True))
-
-
-FAMILIES = {
-    "icosphere": Family(lambda k: ltl.shapes.icosphere(3 + k), sphere_modes, sphere_spectrum),
-    "jittered sphere": Family(lambda k: ltl.shapes.jittered_sphere(3 + k, 0.5, seed=0), sphere_modes, sphere_spectrum),
-    "random sphere": Family(lambda k: ltl.shapes.random_sphere(640 * 4**k + 2, seed=0), sphere_modes, sphere_spectrum),
-    "torus": Family(lambda k: ltl.shapes.torus(MAJOR, MINOR, 36 * 2**k, 18 * 2**k), torus_modes, torus_spectrum),
-    # The faces stay while the vertices move, so that about one in a hundred folds over.
-    "jittered torus": Family(
-        lambda k: ltl.shapes.jittered_torus(36 * 2**k, 18 * 2**k, amount=0.45, seed=0, major=MAJOR, minor=MINOR),
-        torus_modes,
-        torus_spectrum,
-    ),
-    "disk": Family(
-        lambda k: ltl.shapes.jittered(ltl.shapes.disk(rings=14 * 2**k), 0.2, seed=0), disk_modes, disk_spectrum
-    ),
-    "hemisphere": Family(jittered_hemisphere, hemisphere_modes, hemisphere_spectrum),
-}
-
-
-# The operators.
-
-
 class Operator(NamedTuple):
-    """A Laplacian as a matrix, the measure (V,) it should keep in heat flow, and a gradient where there is one.
+    """A Laplacian as a matrix.
 
-    Where ``is_symmetric``, diag(measure) @ matrix is symmetric.
+    Attributes:
+        matrix: (V, V) the matrix.
+        measure: (V,) measure that heat flow should conserve.
+        is_symmetric: whether diag(measure) @ matrix is symmetric.
+        gradient: function that returns the gradient (V, 3) of a field; None if the package has none.
     """
 
     matrix: scipy.sparse.csr_array
@@ -237,7 +74,7 @@ class Operator(NamedTuple):
 
 
 def ours(scheme, mesh):
-    """A scheme of this package; where it has no conserved measure, the vertex areas stand in."""
+    """A scheme of this package. If it has no conserved measure, the vertex areas are used."""
     surface = ltl.Surface.from_mesh(mesh, scheme)
     measure = surface.mass if isinstance(scheme, ltl.Monotone) else surface.vertex_areas
     gradient = functools.partial(ltl.gradient, surface)
@@ -245,7 +82,7 @@ def ours(scheme, mesh):
 
 
 def libigl(mesh):
-    """Cotangent weights, mixed Voronoi areas, and the mean of the face gradients weighted by area."""
+    """Cotangent weights, mixed Voronoi areas, and the area-weighted mean of the face gradients."""
     vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
 
     def gradient(u):
@@ -278,7 +115,7 @@ OTHERS = {"libigl": libigl, REFERENCE: intrinsic_delaunay, "LaPy": lapy_linear}
 
 
 def operators():
-    """Constructors by name: the schemes of this package, then the others."""
+    """Constructors by name: the schemes of this package, then the other packages."""
     schemes = {
         "Paper": ltl.Paper(),
         "Monotone": ltl.Monotone(),
@@ -301,22 +138,19 @@ def vertex_sums(mesh, on_faces):
     return sums
 
 
-# The measurements.
-
-
 def measure(operator, mesh, modes, spectrum):
-    """All columns of one row; None where an operator has no such thing, "overflows" where heat grows.
+    """All columns of one row: None if an operator lacks the quantity, "overflows" if heat grows.
 
-    Errors are relative, and over the modes the root of the mean square; the largest pointwise one is the worst mode's.
+    Errors are relative, and are root mean squares over the modes. The pointwise maximum is of the worst mode.
     """
     areas = vertex_sums(mesh, face_areas(mesh)[:, None])[:, 0] / 3
     rates = np.array([mode.eigenvalue for mode in modes])
     u0 = np.stack([mode.values for mode in modes], axis=1)
     laplacian = -rates * u0
-    found = operator.matrix @ u0
+    approximation = operator.matrix @ u0
     row = {
-        "laplacian_rms": relative(found, laplacian),
-        "laplacian_max": np.max(np.abs(found - laplacian).max(axis=0) / np.abs(laplacian).max(axis=0)),
+        "laplacian_rms": relative(approximation, laplacian),
+        "laplacian_max": np.max(np.abs(approximation - laplacian).max(axis=0) / np.abs(laplacian).max(axis=0)),
         "gradient": None,
         "heat": "overflows",
         "poisson": relative(without_mean(poisson(operator, laplacian, areas), areas), without_mean(u0, areas), areas),
@@ -337,13 +171,13 @@ def measure(operator, mesh, modes, spectrum):
     return row
 
 
-def relative(found, exact, weights=1.0):
-    """The relative errors of the columns, and of these the root of the mean square."""
+def relative(approximation, exact, weights=1.0):
+    """The root mean square of the relative errors of the columns."""
 
     def squared(field):
         return np.sum(np.multiply(weights, (field**2).T), axis=1)
 
-    return np.sqrt(np.mean(squared(found - exact) / squared(exact)))
+    return np.sqrt(np.mean(squared(approximation - exact) / squared(exact)))
 
 
 def without_mean(u, areas):
@@ -351,9 +185,9 @@ def without_mean(u, areas):
 
 
 def heat(operator, u):
-    """u_t = Delta u up to TIME by the diagonal Pade approximant of order eight; its error is below 1e-11 here.
+    """The solution of u_t = Delta u at TIME, by the diagonal Pade approximant of order eight (error below 1e-11 here).
 
-    In partial fractions: 1 + 2 Re(sum of residue / (z - pole)) over the poles above the real axis.
+    In partial fractions it is 1 + 2 Re(sum of residue / (z - pole)) over the poles above the real axis.
     """
     order = 4
     numerator = np.polynomial.Polynomial(
@@ -373,9 +207,9 @@ def heat(operator, u):
 
 
 def overflows(operator, u0, u1):
-    """Whether heat grows tenfold, or a mode of the operator would grow that far from rounding alone.
+    """Whether heat grows tenfold, or a mode of the operator would grow that much from rounding errors.
 
-    Implicit steps damp modes that grow much faster than a step, so these are sought among the eigenvalues.
+    Implicit steps damp modes that grow much faster than a step, so these modes are found by their eigenvalues.
     """
     if not np.isfinite(u1).all() or np.linalg.norm(u1) > 10 * np.linalg.norm(u0):
         return True
@@ -383,34 +217,34 @@ def overflows(operator, u0, u1):
     options = dict(which="LR", ncv=40, maxiter=20, tol=1e-3, v0=start, return_eigenvectors=False)
     try:
         rate = eigs(operator.matrix, 1, **options)[0].real
-    except ArpackNoConvergence:  # a growing mode stands alone and is found soon; those near zero are crowded
+    except ArpackNoConvergence:  # isolated growing modes converge fast; clustered modes near zero do not
         return False
     return rate * TIME > np.log(10 / np.finfo(float).eps)
 
 
 def poisson(operator, f, areas):
-    """The columns u of area mean zero with Delta u = f up to a constant."""
+    """The solutions u of Delta u = f up to a constant, with zero mean over the area."""
     border = scipy.sparse.csr_array(np.ones((len(f), 1)))
     system = scipy.sparse.block_array([[operator.matrix, border], [scipy.sparse.csr_array(areas[None]), None]])
     return splu(scipy.sparse.csc_array(system)).solve(np.vstack([f, np.zeros(f.shape[1])]))[:-1]
 
 
 def eigenvalue_error(operator, spectrum):
-    """The worst relative error of the first nonzero eigenvalues, in order of their real parts."""
+    """The worst relative error of the first nonzero eigenvalues, sorted by their real parts."""
     matrix = scipy.sparse.csc_array(-operator.matrix)
     start = np.random.default_rng(0).normal(size=len(operator.measure))
-    # Twice as many as needed: Arnoldi's method finds the copies of a multiple eigenvalue late.
+    # Compute twice as many as needed, because Arnoldi's method finds the copies of a multiple eigenvalue late.
     try:
-        found = eigs(matrix, 2 * NUM_EIGENVALUES, sigma=SHIFT, v0=start, tol=1e-12, return_eigenvectors=False)
+        values = eigs(matrix, 2 * NUM_EIGENVALUES, sigma=SHIFT, v0=start, tol=1e-12, return_eigenvectors=False)
     except ArpackNoConvergence:
         return None
-    _, *found = sorted(found, key=lambda value: abs(value - SHIFT))[: NUM_EIGENVALUES + 1]  # the first is zero
+    _, *nonzero = sorted(values, key=lambda value: abs(value - SHIFT))[: NUM_EIGENVALUES + 1]  # the first is zero
     exact = spectrum[:NUM_EIGENVALUES]
-    return np.max(np.abs(np.sort(np.real(found)) - exact) / exact)
+    return np.max(np.abs(np.sort(np.real(nonzero)) - exact) / exact)
 
 
 def largest_real_part(operator):
-    """Of the whole spectrum, by the spectral radius: positive where some field grows."""
+    """The largest real part of the spectrum, divided by the spectral radius; positive if some field grows."""
     if len(operator.measure) > LARGEST_DENSE:
         return None
     dense = operator.matrix.toarray()
@@ -423,26 +257,25 @@ def largest_real_part(operator):
 
 
 def negative_share(matrix):
-    """Of the weights of neighbours that are not zero to rounding."""
+    """The fraction of negative weights among the nonzero weights of neighbours."""
     entries = matrix.tocoo()
     weights = entries.data[entries.row != entries.col]
     scale = np.abs(matrix.diagonal())[entries.row[entries.row != entries.col]]
     return np.mean(weights[np.abs(weights) > ROUNDING * scale] < 0)
 
 
-# The output.
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--refinements", type=int, default=4, help="meshes of each family, from 640 vertices on")
+    parser.add_argument(
+        "--refinements", type=int, default=4, help="number of meshes of each family, from 640 vertices on"
+    )
     parser.add_argument("--families", default=",".join(FAMILIES), help=f"among {', '.join(FAMILIES)}")
     parser.add_argument("--plot", help="write a picture of the errors over the mesh size to this file")
     parser.add_argument("--json", help="write the rows to this file")
     arguments = parser.parse_args()
     families = [name.strip() for name in arguments.families.split(",")]
     if unknown := set(families) - set(FAMILIES):
-        parser.error(f"no such family: {', '.join(sorted(unknown))}; choose among {', '.join(FAMILIES)}")
+        parser.error(f"There is no family {', '.join(sorted(unknown))}. Choose among {', '.join(FAMILIES)}.")
 
     rows = [row for family in families for row in family_rows(family, arguments.refinements)]
     print_rows(rows)
@@ -488,7 +321,7 @@ def cell(row, column):
 
 
 def print_orders(rows):
-    print("\nOrders: the slope of log(error) over log(mean edge length), by least squares.\n")
+    print("\nOrders of accuracy: the slope of log(error) over log(mean edge length), by least squares.\n")
     body = [
         [family, operator, *(order(group, column) for column in ERRORS)]
         for (family, operator), group in by_curve(rows).items()
@@ -511,7 +344,7 @@ def order(group, column):
 
 
 def print_ratios(rows):
-    print(f"\nErrors on the finest mesh, divided by those of {REFERENCE}: below 1 is better.\n")
+    print(f"\nErrors on the finest mesh, divided by the errors of {REFERENCE}; a ratio below 1 is better.\n")
     finest = {key: group[-1] for key, group in by_curve(rows).items()}
     body = [
         [family, operator, *(ratio(row[column], finest[family, REFERENCE][column]) for column in RATIOS)]
@@ -521,8 +354,8 @@ def print_ratios(rows):
     print_table(["mesh", "operator", *(COLUMNS[column] for column in RATIOS)], body)
 
 
-def ratio(found, reference):
-    return f"{found / reference:.3g}" if isinstance(found, float) and isinstance(reference, float) else "-"
+def ratio(error, reference):
+    return f"{error / reference:.3g}" if isinstance(error, float) and isinstance(reference, float) else "-"
 
 
 def print_table(header, body):
@@ -531,7 +364,7 @@ def print_table(header, body):
 
 
 def plot(rows, path):
-    """One column of panels per mesh family; this package in full lines, the others dashed, second order dotted."""
+    """Draw one column of panels per mesh family: this package solid, others dashed, second order dotted."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -543,7 +376,7 @@ def plot(rows, path):
     shown = {"heat": "heat", "poisson": "Poisson", "laplacian_rms": "Laplacian, pointwise"}
     size = (2.6 * len(families) + 1, 9.5)
     figure, panels = plt.subplots(len(shown), len(families), figsize=size, sharex="col", sharey="row", squeeze=False)
-    # The others often coincide: open markers of falling size stay visible on top of each other.
+    # The other packages often coincide. Open markers of decreasing size stay visible on top of each other.
     markers = {"libigl": ("s", 9), REFERENCE: ("D", 6), "LaPy": ("x", 4)}
     colors = dict(zip(names, plt.get_cmap("Dark2").colors, strict=True))
     curves = by_curve(rows)

@@ -2,12 +2,12 @@
 
 python benchmarks/creases.py [--problems folds,cube] [--json creases.json]
 
-The Laplacian of a surface does not see how the surface bends in space, so a sheet folded along a line, a box and a CAD
-part should give the accuracy of a plane. Every problem has a known answer, and every figure is a relative error. Errors
-of fields are in the L2 norm, weighted by vertex areas; errors of eigenvalues are the worst or the mean, as named. Where
-the ratio of ``Monotone()`` to robust-laplacian is below 1, this package is better. The peer (install ltljax[bench])
-enters as -M^-1 S with its lumped mass matrix M. Real meshes are read from ``../shared/meshes`` and left out where that
-folder is absent; the CAD part is left out where manifold3d is not installed.
+The Laplacian of a surface does not depend on how the surface bends in space, so a folded sheet, a box and a CAD part
+should be as accurate as a plane. Every problem has a known solution, and every figure is a relative error. Errors of
+fields are in the L2 norm, weighted by vertex areas; errors of eigenvalues are the worst or the mean, as named. A ratio
+of ``Monotone()`` to robust-laplacian below 1 means that this package is more accurate. robust-laplacian (install
+ltljax[bench]) is used as -M^-1 S with its lumped mass matrix M. Real meshes are read from ``../shared/meshes`` and
+omitted if that folder is missing; the CAD part is omitted if manifold3d is not installed.
 """
 
 import argparse
@@ -39,12 +39,12 @@ DEFAULT, CHORD, PEER = "Monotone()", 'Monotone(lift="chord")', "robust-laplacian
 SCHEMES = {DEFAULT: ltl.Monotone(), CHORD: ltl.Monotone(lift="chord")}
 SCANS = Path(__file__).parents[2] / "shared" / "meshes"
 TIME, TIME_STEPS = 0.1, 8
-SHIFT = -0.1  # eigenvalues of -Delta are sought near it
-SMALL_POLYHEDRON = 60_000  # vertices; a polyhedron is refined twice, and on as long as it stays below this size
+SHIFT = -0.1  # eigenvalues of -Delta are computed near this value
+SMALL_POLYHEDRON = 60_000  # vertices; a polyhedron is refined at least twice, and again while it stays smaller
 
 
 class Operator(NamedTuple):
-    """A Laplacian as a matrix. The peer has a lumped mass (V,), and ``diag(mass) @ matrix`` is symmetric."""
+    """A Laplacian as a matrix. That of robust-laplacian has a lumped mass; ``diag(mass) @ matrix`` is symmetric."""
 
     matrix: scipy.sparse.csr_array
     mass: np.ndarray | None = None
@@ -59,7 +59,7 @@ def robust(vertices, faces):
 
 
 def compare(problem, mesh, measures):
-    """One row for each of the measures {quantity: (function, *arguments)}, called as function(operator, mesh, ...)."""
+    """One row for each measure {quantity: (function, *arguments)}, called as function(operator, mesh, *arguments)."""
     start, rows = time.perf_counter(), []
     surfaces = {scheme: ltl.Surface.from_mesh(mesh, scheme) for scheme in set(SCHEMES.values())}
     operators = {scheme: Operator(ltl.laplacian_matrix(s), surface=s) for scheme, s in surfaces.items()}
@@ -77,7 +77,7 @@ def compare(problem, mesh, measures):
 def heat_error(operator, mesh, u, u1):
     """The error of u_t = Delta u from u to u1 at TIME, by the [3/4] Pade approximant of exp in partial fractions.
 
-    The approximant is of order seven and damps stiff modes; what it adds to the error is below 1e-8 here.
+    The approximant is seventh order and damps stiff modes. It adds less than 1e-8 to the error here.
     """
     numerator, denominator = scipy.interpolate.pade(1 / scipy.special.factorial(np.arange(8)), 4, 3)
     poles = [pole for pole in denominator.roots if pole.imag > 0]
@@ -90,7 +90,7 @@ def heat_error(operator, mesh, u, u1):
 
 
 def screened_error(operator, mesh, u, laplacian):
-    """The error of Delta u - u = f without flux through a boundary."""
+    """The error of Delta u - u = f with zero flux through the boundary."""
     solve = factorized(operator.matrix - scipy.sparse.eye_array(len(u)))
     return relative(solve(laplacian - u), u, mesh)
 
@@ -104,7 +104,7 @@ def dirichlet_error(operator, mesh, u, laplacian):
 
 
 def derivative_error(operator, mesh, derivative, u, exact, mask):
-    """The error of a derivative over part of the surface, relative to the derivative over all of it."""
+    """The error of a derivative on part of the surface, relative to the derivative on the whole surface."""
     if operator.surface is None:
         return None
     return relative(np.where(mask, derivative(operator.surface, u), exact), exact, mesh)
@@ -116,7 +116,7 @@ def eigenvalue_error(operator, mesh, spectrum, summary):
 
 
 def eigenvalues(operator, count):
-    """The first nonzero eigenvalues of -Delta, in order of their real parts."""
+    """The first nonzero eigenvalues of -Delta, sorted by their real parts."""
     size = operator.matrix.shape[0]
     solver, mass = (eigs, np.ones(size)) if operator.mass is None else (eigsh, operator.mass)
     mass = scipy.sparse.diags_array(mass)
@@ -124,51 +124,52 @@ def eigenvalues(operator, count):
     inverse = LinearOperator((size, size), factorized(stiffness - SHIFT * mass))
     start = np.random.default_rng(0).normal(size=size)
     options = dict(M=mass, sigma=SHIFT, OPinv=inverse, v0=start, tol=1e-10, return_eigenvectors=False)
-    # Twice as many as needed, because Krylov methods find the copies of a multiple eigenvalue late.
+    # Compute twice as many as needed, because Krylov methods find the copies of a multiple eigenvalue late.
     return np.sort(solver(stiffness, 2 * count, **options).real)[1 : count + 1]
 
 
 def polyhedron_spectrum(mesh, count):
-    """The first nonzero eigenvalues of the polyhedron itself: the limit of splitting its faces in their planes.
+    """The first nonzero eigenvalues of the polyhedron itself, in the limit of subdividing its faces in their planes.
 
-    Richardson extrapolation of the peer's eigenvalues, by the order that the last two differences show, between 1 and
-    4: it is below 2 where the angles at a vertex add up to more than 2 pi. Where they differ in sign it is 2.
+    The eigenvalues of robust-laplacian are extrapolated by Richardson's method. The order is estimated from the last
+    two differences, between 1 and 4. It is below 2 if face angles at a vertex add up to more than 2 pi. If the
+    differences have different signs, order 2 is used.
     """
     vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
     levels = [eigenvalues(robust(vertices, faces), count)]
     while len(levels) < 3 or 4 * len(vertices) < SMALL_POLYHEDRON:
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
         levels.append(eigenvalues(robust(vertices, faces), count))
-    before, last = levels[-2] - levels[-3], levels[-1] - levels[-2]
-    order = np.where(before * last > 0, np.clip(np.log2(np.abs(before / last)), 1, 4), 2)
+    previous, last = levels[-2] - levels[-3], levels[-1] - levels[-2]
+    order = np.where(previous * last > 0, np.clip(np.log2(np.abs(previous / last)), 1, 4), 2)
     return levels[-1] + last / (2**order - 1)
 
 
 def relative(u, exact, mesh):
-    """The relative error in the L2 norm, a third of the area of every face at each of its corners."""
+    """The relative error in the L2 norm, with a third of the area of every face at each of its corners."""
     face_areas = trimesh.triangles.area(mesh.vertices[mesh.faces])
     areas = np.bincount(mesh.faces.ravel(), np.repeat(face_areas / 3, 3))
     return float(np.sqrt(areas @ (u - exact) ** 2 / (areas @ exact**2)))
 
 
 def factorized(matrix):
-    """The function b -> x with matrix x = b. The matrix is diagonally dominant and needs no pivoting."""
+    """The function that solves matrix x = b. The matrix is diagonally dominant, so pivoting is not needed."""
     matrix = scipy.sparse.csr_array(matrix)
-    # SuperLU's minimum degree order takes minutes on subdivided meshes unless neighbours are near one another.
+    # SuperLU's minimum degree ordering takes minutes on subdivided meshes unless neighbours have similar indices.
     order = reverse_cuthill_mckee(scipy.sparse.csr_array(abs(matrix) + abs(matrix.T)), symmetric_mode=True)
     options = dict(permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True))
     factors = splu(scipy.sparse.csc_array(matrix[order][:, order]), **options)
-    place = np.argsort(order)
-    return lambda b: factors.solve(b[order].astype(matrix.dtype))[place]
+    inverse_order = np.argsort(order)
+    return lambda b: factors.solve(b[order].astype(matrix.dtype))[inverse_order]
 
 
 def decaying(u, rate):
-    """The measures of an eigenfunction: Delta u = -rate u, and no flux crosses the boundary."""
+    """The measures of an eigenfunction: Delta u = -rate u, with zero flux through the boundary."""
     return {"heat": (heat_error, u, np.exp(-rate * TIME) * u), "screened Poisson": (screened_error, u, -rate * u)}
 
 
 def folds(n=48):
-    """The strip [0, 2] x [0, 1] bent along x = 1, with u = cos(pi x / 2) in the unfolded x and no flux."""
+    """The strip [0, 2] x [0, 1], bent along x = 1, with u = cos(pi x / 2) in the unfolded x and zero flux."""
     derivatives = {
         "gradient": lambda surface, u: np.linalg.norm(ltl.gradient(surface, u), axis=1),
         "Hessian": lambda surface, u: np.linalg.norm(ltl.hessian(surface, u), axis=(1, 2)),
@@ -181,20 +182,20 @@ def folds(n=48):
         u = np.cos(np.pi * x / 2)
         exact = {"gradient": np.pi / 2 * np.sin(np.pi * x / 2), "Hessian": rate * np.abs(u), "div grad": -rate * u}
         measures = decaying(u, rate)
-        # Fits within three cells of the rim see the rim.
+        # Fits within three cells of the boundary use boundary vertices.
         inner = np.all((plane > 3 / n) & (plane < np.array([2, 1]) - 3 / n), axis=1)
-        for where, mask in {"inside": inner, "near the crease": inner & (np.abs(x - 1) < 3 / n)}.items():
+        for region, mask in {"inside": inner, "near the crease": inner & (np.abs(x - 1) < 3 / n)}.items():
             for name, function in derivatives.items():
-                measures[f"{name} {where}"] = (derivative_error, function, u, exact[name], mask)
+                measures[f"{name} {region}"] = (derivative_error, function, u, exact[name], mask)
         rows += compare(f"fold of {angle} degrees", mesh, measures)
-    flat = {row["quantity"]: row for row in reversed(rows)}  # the first row of each quantity stays
+    flat = {row["quantity"]: row for row in reversed(rows)}  # the first row of each quantity
     return [row | {f"{name} / flat": row[name] / flat[row["quantity"]][name] for name in SCHEMES} for row in rows]
 
 
 def bent_strip(n, angle):
-    """The strip of 2 n by n cells: the vertices (V, 2) before it is bent, and its mesh after.
+    """The strip of 2 n by n cells: its vertices (V, 2) before bending, and its mesh after bending.
 
-    Vertices are moved by up to .3 cells, those of the rim and of the crease along it. Diagonals are random.
+    Vertices are moved by up to 0.3 cells, on the rim and the crease only along them. Diagonals are random.
     """
     random = np.random.default_rng(0)
     cells = np.stack(np.meshgrid(np.arange(2 * n + 1), np.arange(n + 1), indexing="ij"), axis=-1)
@@ -212,7 +213,7 @@ def bent_strip(n, angle):
 
 
 def cube(n=40):
-    """The unit cube; its first two eigenvalues have three eigenfunctions each."""
+    """The unit cube, whose first two eigenvalues have three eigenfunctions each."""
     square, edges = ltl.shapes.square(1.0, n), np.roll(np.eye(3), 1, axis=0)
     low = [np.roll(square.vertices, k, axis=1) for k in range(3)]
     mesh = welded(*((side, square.faces) for k in range(3) for side in (low[k], low[k] + edges[k])))
@@ -230,9 +231,10 @@ def can(rings=36, n_along=60):
 
 
 def can_spectrum(count):
-    """Roots e = k^2 + m^2 of w' J_m(sqrt(e)) + w sqrt(e) J_m'(sqrt(e)), which joins values and fluxes at the rim z = 1.
+    """The first eigenvalues of the can: roots e = k^2 + m^2 of w' J_m(sqrt(e)) + w sqrt(e) J_m'(sqrt(e)) at z = 1.
 
-    On the lids u = J_m(sqrt(e) r) cos(m t), on the side w(z) cos(m t), w = cos(k z) or sin(k z) / k, k^2 of any sign.
+    On the lids u = J_m(sqrt(e) r) cos(m t), and on the side u = w(z) cos(m t) with w = cos(k z) or sin(k z) / k, where
+    k^2 has any sign. The equation matches values and fluxes at the rim z = 1.
     """
 
     def mismatch(e, m, is_even):
@@ -250,7 +252,7 @@ def can_spectrum(count):
 
 
 def welded(*pieces):
-    """One mesh of pieces (vertices, faces) that share vertices; positions are rounded so that these are equal."""
+    """One mesh of pieces (vertices, faces). Positions are rounded, so that shared vertices are equal."""
     vertices, faces = trimesh.util.append_faces(*zip(*pieces, strict=True))
     return ltl.Mesh(np.round(vertices, 12) + 0.0, faces, weld=True)
 
@@ -269,7 +271,7 @@ def cones():
 
 
 def cone_lattice(sine, rings):
-    """Distances r from the tip, angles t about the axis, and faces: even rings, jittered by .2 of their spacing."""
+    """Distances r from the tip, angles t about the axis, and faces. Even rings are jittered by 0.2 of their spacing."""
     sizes = np.array([1] + [max(6, round(2 * np.pi * sine * j)) for j in range(1, rings + 1)])
     starts, ring = np.cumsum([0, *sizes]), np.repeat(np.arange(rings + 1), sizes)
     shift = np.random.default_rng(0).uniform(-0.2, 0.2, (2, len(ring)))
@@ -277,7 +279,7 @@ def cone_lattice(sine, rings):
     r, t = (ring + shift[0]) / rings, 2 * np.pi * (np.arange(len(ring)) - starts[ring] + shift[1]) / sizes[ring]
     faces = []
     for m, n, inner, outer in zip(sizes, sizes[1:], starts, starts[1:], strict=False):
-        # Every edge of a ring gets the vertex of the other ring that is nearest in angle.
+        # Every edge of a ring is joined to the vertex of the other ring that is closest in angle.
         j, k = np.arange(m if m > 1 else 0), np.arange(n)
         to_inner, to_outer = -((n - (2 * k + 1) * m) // (2 * n)) % m, ((2 * j + 1) * n + m) // (2 * m) % n
         faces.append(np.stack([outer + k, outer + (k + 1) % n, inner + to_inner], axis=1))
@@ -286,21 +288,21 @@ def cone_lattice(sine, rings):
 
 
 def scans():
-    """Real meshes, against the exact eigenvalues of the same polyhedra."""
+    """Real meshes, compared with the exact eigenvalues of the same polyhedra."""
     rows = []
     names = ("spot_low", "spot", "bunny_closed", "armadillo", "hand_open", "stanford_bunny")
     for path in filter(Path.exists, (SCANS / f"{name}.obj" for name in names)):
         mesh = ltl.load_mesh(path)
-        mesh = mesh.scaled(np.sqrt(4 * np.pi / mesh.area))  # so that the first eigenvalues are about 1
+        mesh = mesh.scaled(np.sqrt(4 * np.pi / mesh.area))  # the first eigenvalues are then about 1
         spectrum = polyhedron_spectrum(mesh, 10)
         rows += compare(path.stem, mesh, {"mean of 10 eigenvalues": (eigenvalue_error, spectrum, np.mean)})
     return rows
 
 
 def part():
-    """A CAD part: a box with a hole, a boss and a slot, its edges split, and raw as the boolean operations leave it."""
+    """A CAD part: a box with a hole, a boss and a slot, with split edges, and raw from the boolean operations."""
     if "manifold" not in trimesh.boolean.engines_available:
-        print("The CAD part is left out: manifold3d is not installed.", file=sys.stderr)
+        print("The CAD part is omitted, because manifold3d is not installed.", file=sys.stderr)
         return []
     box = trimesh.creation.box((1.0, 0.7, 0.3))
     boss = trimesh.creation.cylinder(0.17, 0.3, sections=32).apply_translation([-0.2, 0.05, 0.2])
@@ -314,12 +316,12 @@ def part():
 
 
 def smooth():
-    """Smooth surfaces, on regular, jittered and random meshes and on stretched ones."""
+    """Smooth surfaces, on regular, jittered, random and stretched meshes."""
     sphere, axes = ltl.shapes.random_sphere(10_242, seed=0), np.array([1.0, 2.0, 3.0])
     ellipsoid = ltl.Mesh(axes * sphere.vertices, sphere.faces)
 
     def torus_level(minor):
-        # JAX's second derivatives of hypot are wrong where both arguments are of one size.
+        # The second derivatives of hypot in JAX are wrong where both arguments have the same size.
         return lambda x: (jnp.sqrt(x[0] ** 2 + x[1] ** 2) - 2) ** 2 + x[2] ** 2 - minor**2
 
     level_sets = {
@@ -343,7 +345,7 @@ def smooth():
         u1 = np.exp(-6 * TIME) * second + np.exp(-12 * TIME) * third
         rows += compare(name, mesh, {"heat": (heat_error, second + third, u1)})
     mesh, k = ltl.shapes.jittered(ltl.shapes.disk(1.0, 57), 0.4, seed=0), scipy.special.jnp_zeros(0, 1)[0]
-    u = scipy.special.jv(0, k * np.linalg.norm(mesh.vertices, axis=1))  # no flux through the rim
+    u = scipy.special.jv(0, k * np.linalg.norm(mesh.vertices, axis=1))  # zero flux through the rim
     return rows + compare("disk jittered by .4", mesh, decaying(u, k**2))
 
 
@@ -353,7 +355,7 @@ def harmonics(x):
 
 
 def on_level_set(level, vertices):
-    """The harmonics on a level set, and their Laplacians there: tr((I - n n^T) D^2 u) - (div n) n . grad u."""
+    """The harmonics on a level set, and their Laplacians tr((I - n n^T) D^2 u) - (div n) n . grad u."""
 
     def normal(x):
         gradient = jax.grad(level)(x)
@@ -377,7 +379,7 @@ def main():
     arguments = parser.parse_args()
     names = [name.strip() for name in arguments.problems.split(",")]
     if unknown := set(names) - set(PROBLEMS):
-        parser.error(f"no such problem: {', '.join(sorted(unknown))}; choose among {', '.join(PROBLEMS)}")
+        parser.error(f"There is no problem {', '.join(sorted(unknown))}. Choose among {', '.join(PROBLEMS)}.")
     warnings.simplefilter("ignore", ltl.errors.InconsistentRowsWarning)
     tables = {name: PROBLEMS[name]() for name in names}
     for name, rows in tables.items():

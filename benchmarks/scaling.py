@@ -2,8 +2,8 @@
 
 python benchmarks/scaling.py [--sizes 10000 30000 100000 300000 1000000]
 
-A slope of 1 is linear cost. Of small meshes a part is the overhead of a call, so that sums over slots slope a little
-less than that. The reverse of a step is taken again and again at one state.
+A slope of 1 is linear cost. On small meshes the overhead of a call counts, so the slopes of sums over slots are
+slightly below 1. The reverse of a step is evaluated repeatedly at the same state.
 """
 
 import argparse
@@ -26,7 +26,7 @@ SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of vertices, roughly")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="approximate numbers of vertices")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     titles, rows = None, []
@@ -34,18 +34,19 @@ def main():
         n_minor = round(math.sqrt(size / 2))
         mesh = ltl.shapes.torus(n_major=2 * n_minor, n_minor=n_minor)
         jittered = ltl.shapes.jittered_torus(2 * n_minor, n_minor, 0.25, seed=0)
-        found = {"build (s)": build(mesh), "build, jittered (s)": build(jittered), **run(mesh)}
+        values = {"build (s)": build(mesh), "build, jittered (s)": build(jittered), **run(mesh)}
         if titles is None:
-            titles = tuple(found)
+            titles = tuple(values)
             print("| vertices | " + " | ".join(titles) + " |\n" + "| --- " * (len(titles) + 1) + "|")
-        rows.append((mesh.num_vertices, *found.values()))
-        print(f"| {mesh.num_vertices} | " + " | ".join(f"{value:.3g}" for value in found.values()) + " |", flush=True)
+        rows.append((mesh.num_vertices, *values.values()))
+        print(f"| {mesh.num_vertices} | " + " | ".join(f"{value:.3g}" for value in values.values()) + " |", flush=True)
     counts, *columns = np.log(np.array(rows)).T
     print("| slope | " + " | ".join(f"{np.polyfit(counts, column, 1)[0]:.2f}" for column in columns) + " |")
 
 
 def build(mesh):
-    _ = mesh.boundary_loops  # of the mesh, not of the surface
+    """The best time to build a surface, in seconds."""
+    _ = mesh.boundary_loops  # computed here, because it belongs to the mesh
     best = math.inf
     for _ in range(3 if mesh.num_vertices < 200_000 else 1):
         start = time.perf_counter()
@@ -55,7 +56,7 @@ def build(mesh):
 
 
 def run(mesh):
-    """Milliseconds of a Laplacian, of a step of reaction-diffusion, and of its transposed derivative."""
+    """Milliseconds of a Laplacian, of a reaction-diffusion step, and of its transposed derivative."""
     surface = ltl.Surface.from_mesh(mesh, dtype=np.float32)
     state, dt = start_of(surface)
     u, kinetics = jnp.asarray(state), kinetics_of(surface)

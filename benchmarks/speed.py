@@ -1,12 +1,12 @@
-"""How fast the loop over slots is, forward and backward, beside what a user would take instead: Markdown tables.
+"""How fast the sum over slots is, forward and in reverse, compared with alternatives: Markdown tables.
 
 python benchmarks/speed.py [--sizes 10000 164000 655000 1000000] [--dtypes float32 float64] [--parts apply step ...]
 python benchmarks/speed.py --device gpu
 
-Every number of a row comes from rounds in which all contestants take turns, each the best of one to three calls, and is
-the median over rounds; compile time stands apart. Contestants hold the same matrix. On a GPU the peers on the host are
-left out, and the bytes a Laplacian must move are set against what a plain copy reaches. Peers come with the extra
-`bench`; one that is missing is left out.
+The contestants of a row take turns. Each figure is the median over rounds of the best of one to three calls. Compile
+times are listed separately. All contestants use the same matrix. On a GPU, contestants that run on the host are
+omitted, and the memory bandwidth of the Laplacian is compared with that of a copy. The extra `bench` installs the other
+packages; missing ones are omitted.
 """
 
 import argparse
@@ -34,7 +34,7 @@ import scipy.sparse  # noqa: E402
 
 import ltljax as ltl  # noqa: E402
 
-# Icospheres where there is one of about the size, else tori.
+# An icosphere if there is one of about the size, otherwise a torus.
 SIZES = (10_000, 164_000, 655_000, 1_000_000)
 SPECIES = (1, 2, 4)
 PARTS = ("apply", "step", "reverse", "order", "build")
@@ -45,7 +45,7 @@ FEED, KILL, DIFFUSIVITY = 0.04, 0.06, (1.0, 0.5)
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of vertices, roughly")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="approximate numbers of vertices")
     parser.add_argument("--dtypes", nargs="+", default=("float32", "float64"), choices=("float32", "float64"))
     parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
     parser.add_argument("--device", default="cpu", choices=("cpu", "gpu"))
@@ -67,24 +67,24 @@ def main():
 
 
 def compare(contestants, rounds=ROUNDS, inner=3):
-    """Milliseconds of each contestant: the median over rounds in which all take turns, each the best of some calls."""
+    """Milliseconds of each contestant: the median over rounds of the best of ``inner`` calls."""
     for contestant in contestants.values():
         contestant()
         contestant()
     times = {name: [] for name in contestants}
     for _ in range(rounds):
         for name, contestant in contestants.items():
-            turn = math.inf
+            best = math.inf
             for _ in range(inner):
                 start = time.perf_counter()
                 contestant()
-                turn = min(turn, time.perf_counter() - start)
-            times[name].append(1e3 * turn)
+                best = min(best, time.perf_counter() - start)
+            times[name].append(1e3 * best)
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
 def compiled(function, *arguments):
-    """The compiled function as a contestant, and the seconds its compilation took."""
+    """A contestant that calls the compiled function, the seconds of compilation, and the executable."""
     start = time.perf_counter()
     executable = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
@@ -109,8 +109,8 @@ def mesh_of(size):
 
 @functools.cache
 def surface_of(size, dtype):
-    mesh_surface = ltl.Surface.from_mesh(mesh_of(size), dtype=dtype)
-    return mesh_surface, ltl.laplacian_matrix(mesh_surface)
+    surface = ltl.Surface.from_mesh(mesh_of(size), dtype=dtype)
+    return surface, ltl.laplacian_matrix(surface)
 
 
 def row(*cells):
@@ -122,12 +122,12 @@ def header(*cells):
     row(*("---" for _ in cells))
 
 
-def ratio(times, ours="ltljax"):
-    """Each contestant's milliseconds, and its time over ours."""
-    cells = []
-    for name, value in times.items():
-        cells.append(f"{value:.2f}" + ("" if name == ours else f" ({value / times[ours]:.2f})"))
-    return cells
+def ratio(times, reference="ltljax"):
+    """The milliseconds of each contestant, and their ratio to the reference."""
+    return [
+        f"{value:.2f}" + ("" if name == reference else f" ({value / times[reference]:.2f})")
+        for name, value in times.items()
+    ]
 
 
 def has(package):
@@ -136,7 +136,7 @@ def has(package):
 
 def apply_table(arguments):
     """The Laplacian."""
-    print("### The Laplacian: milliseconds (and times ltljax's)\n")
+    print("### The Laplacian: milliseconds (and the ratio to ltljax)\n")
     on_host = arguments.device == "cpu"
     titles = None
     for dtype in map(np.dtype, arguments.dtypes):
@@ -150,11 +150,12 @@ def apply_table(arguments):
                 contestants = {"ltljax": ours, **jax_peers(matrix, u)}
                 if on_host:
                     contestants |= host_peers(matrix, state)
-                # A product that takes seconds is not worth nine rounds of three.
-                times = compare(contestants, rounds=ROUNDS if size <= 200_000 else 5, inner=3 if size <= 200_000 else 2)
+                # Large products take seconds, so they get fewer rounds.
+                rounds, inner = (ROUNDS, 3) if size <= 200_000 else (5, 2)
+                times = compare(contestants, rounds, inner)
                 if titles is None:
                     titles = tuple(times)
-                    bandwidth = () if on_host else ("GB/s", "of a copy's")
+                    bandwidth = () if on_host else ("GB/s", "of a copy")
                     header("dtype", "vertices", "S", *titles, "compile (s)", *bandwidth)
                 extra = () if on_host else achieved(surface, u, times["ltljax"])
                 row(dtype, surface.num_vertices, species, *ratio(times), f"{seconds:.2f}", *extra)
@@ -194,7 +195,7 @@ def host_peers(matrix, state):
 
 
 def achieved(surface, u, milliseconds):
-    """Bytes a Laplacian must move per second, in GB/s, and their share of what a copy reaches."""
+    """The memory bandwidth of a Laplacian in GB/s, and its ratio to the bandwidth of a copy."""
     table, weights = surface.topology.diffusion.blocks[0], surface.geometry.laplacian_weights[0]
     rate = (table.indices.nbytes + weights.nbytes + 2 * u.nbytes) / milliseconds / 1e6
     big = jnp.zeros(1 << 27, jnp.float32)
@@ -204,20 +205,20 @@ def achieved(surface, u, milliseconds):
 
 
 def row_major_tables(matrix):
-    """Indices and weights (V, K) of a matrix, of the width of its longest row; an empty slot holds the vertex."""
+    """Indices and weights (V, K) of a matrix, as wide as its longest row; an empty slot holds the vertex itself."""
     parts = scipy.sparse.csr_array(matrix - scipy.sparse.diags_array(matrix.diagonal()))
     parts.eliminate_zeros()
     lengths = np.diff(parts.indptr)
     slot = np.arange(lengths.max())[None]
     position = np.minimum(parts.indptr[:-1, None] + slot, parts.nnz - 1)
-    used = slot < lengths[:, None]
-    indices = np.where(used, parts.indices[position], np.arange(len(lengths))[:, None]).astype(np.int32)
-    return indices, np.where(used, parts.data[position], 0).astype(matrix.dtype)
+    is_used = slot < lengths[:, None]
+    indices = np.where(is_used, parts.indices[position], np.arange(len(lengths))[:, None]).astype(np.int32)
+    return indices, np.where(is_used, parts.data[position], 0).astype(matrix.dtype)
 
 
 @functools.cache
 def numba_kernels():
-    """Kernels fused by hand, with two threads: the limit to approach. Row-major tables suit them best."""
+    """Kernels fused by hand, with two threads, as a bound on the speed. Row-major tables are the fastest for them."""
     import numba
 
     numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
@@ -227,10 +228,10 @@ def numba_kernels():
     def total(indices, weights, u, out):
         for v in numba.prange(u.shape[0]):
             for s in range(u.shape[1]):
-                here, sum_ = u[v, s], u[v, s] * 0
+                centre, accumulated = u[v, s], u[v, s] * 0
                 for k in range(indices.shape[1]):
-                    sum_ += weights[v, k] * (u[indices[v, k], s] - here)
-                out[v, s] = sum_
+                    accumulated += weights[v, k] * (u[indices[v, k], s] - centre)
+                out[v, s] = accumulated
 
     @numba.njit(**options)
     def step(indices, weights, u, out, dt, da, db, feed, kill):
@@ -249,7 +250,7 @@ def numba_kernels():
 
 
 def start_of(surface):
-    """A random state, and a step within the bound of stability."""
+    """A random state, and a stable step length."""
     u = np.random.default_rng(0).random((surface.num_vertices, 2)).astype(surface.dtype)
     return u, surface.dtype.type(0.5 / float(ltl.operators.spectral_bound(surface)))
 
@@ -266,7 +267,7 @@ def kinetics_of(surface):
 def step_table(arguments):
     """A step of a reaction-diffusion run."""
     count = 20
-    print("### A step of Gray and Scott's reaction-diffusion, in a run: milliseconds (and times ltljax's)\n")
+    print("### A step of a Gray-Scott reaction-diffusion run: milliseconds (and the ratio to ltljax)\n")
     titles = None
     for dtype in map(np.dtype, arguments.dtypes):
         for size in arguments.sizes:
@@ -276,8 +277,7 @@ def step_table(arguments):
             def run(surface, u, kinetics, dt=dt):
                 return jax.lax.scan(lambda u, _: (step(surface, u, dt, kinetics), None), u, length=count)[0]
 
-            ours, seconds, executable = compiled(run, surface, jnp.asarray(state), kinetics_of(surface))
-            del executable
+            ours, seconds, _ = compiled(run, surface, jnp.asarray(state), kinetics_of(surface))
             contestants = {"ltljax": ours}
             if arguments.device == "cpu":
                 contestants |= host_runs(matrix, state, dt, count)
@@ -320,8 +320,11 @@ def host_runs(matrix, state, dt, count):
 
 def reverse_table(arguments):
     """The gradient of a run."""
-    print(f"### The gradient of {STEPS} explicit steps over the run itself: times, and memory in states\n")
-    print("With respect to two rates and the initial state. Memory is XLA's own account of temporaries.\n")
+    print(f"### The gradient of {STEPS} explicit steps: time relative to the run, and memory in states\n")
+    print(
+        "The gradient is with respect to two rates and the initial state. "
+        "Memory is that of temporaries, as reported by XLA.\n"
+    )
     inner = round(math.sqrt(STEPS))
     while STEPS % inner:
         inner += 1
@@ -345,15 +348,15 @@ def reverse_table(arguments):
 
             data = kinetics_of(surface), jnp.asarray(state)
             contestants, memory, seconds = {}, {}, {}
-            for name, where, checkpoints, wanted in (
+            for name, target, checkpoints, derivative in (
                 ("run", surface, False, run),
                 ("gradient", surface, False, jax.value_and_grad(run, argnums=(0, 1))),
                 ("checkpoints", surface, True, jax.value_and_grad(run, argnums=(0, 1))),
                 ("scattering", scattering, False, jax.value_and_grad(run, argnums=(0, 1))),
             ):
-                function = functools.partial(wanted, checkpoints=checkpoints)
+                function = functools.partial(derivative, checkpoints=checkpoints)
                 contestants[name], seconds[name], executable = compiled(
-                    lambda k, u, s, f=function: f(k, u, s), *data, where
+                    lambda k, u, s, f=function: f(k, u, s), *data, target
                 )
                 memory[name] = executable.memory_analysis().temp_size_in_bytes / state.nbytes
             times = compare(contestants, rounds=5, inner=1)
@@ -364,8 +367,8 @@ def reverse_table(arguments):
 
 
 def order_table(arguments):
-    """What the order of vertices costs."""
-    print("### Order of the vertices: the Laplacian, milliseconds\n")
+    """The cost of a bad order of the vertices."""
+    print("### Order of the vertices: milliseconds of the Laplacian\n")
     header("vertices", "S", "as generated", "shuffled", "shuffled, then reordered", "reordering (s)")
     for size in [size for size in arguments.sizes if size >= 100_000]:
         mesh = mesh_of(size)
@@ -385,8 +388,8 @@ def order_table(arguments):
 
 
 def build_table(arguments):
-    """How long a surface takes to build, and its peak memory, each in a process of its own."""
-    print("### Building: seconds, and the peak of memory above the mesh's, in bytes per vertex\n")
+    """The time and peak memory of building a surface, each in a separate process."""
+    print("### Building a surface: seconds, and bytes per vertex of memory in addition to the mesh\n")
     header("mesh", "vertices", "ltljax", "peak", "kept", "Paper", "robust-laplacian", "libigl")
     for kind in ("icosphere", "jittered torus"):
         for size in arguments.sizes:
@@ -407,7 +410,7 @@ def run_child(call):
 
 
 def child(kind, size, what):
-    """One build, alone in its process, so that its peak of memory is its own."""
+    """One build, alone in its process, so that the peak memory belongs to it."""
     warnings.simplefilter("ignore")
     n_minor = round(math.sqrt(int(size) / 2))
     mesh = (
@@ -416,12 +419,12 @@ def child(kind, size, what):
         else ltl.shapes.jittered_torus(2 * n_minor, n_minor, 0.25, seed=0)
     )
     jnp.zeros(1).block_until_ready()
-    _ = mesh.boundary_loops  # of the mesh, not of the surface
+    _ = mesh.boundary_loops  # computed here, because it belongs to the mesh
     peer = None if hasattr(ltl, what) else importlib.import_module(what)
     resident = lambda: int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()  # noqa: E731, SIM115
-    before, peak_before = resident(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    resident_before, peak_before = resident(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     start = time.perf_counter()
-    kept = 0
+    size_of_surface = 0
     if what == "robust_laplacian":
         peer.mesh_laplacian(mesh.vertices, mesh.faces)
     elif what == "igl":
@@ -429,13 +432,13 @@ def child(kind, size, what):
         peer.massmatrix(np.array(mesh.vertices), np.array(mesh.faces))
     else:
         surface = jax.block_until_ready(ltl.Surface.from_mesh(mesh, getattr(ltl, what)()))
-        kept = sum(leaf.nbytes for leaf in jax.tree.leaves(surface))
+        size_of_surface = sum(leaf.nbytes for leaf in jax.tree.leaves(surface))
     seconds = time.perf_counter() - start
-    # Where the mesh itself needed more, the build's own peak is not seen; then what is resident now is the least.
+    # If making the mesh needed more memory, the peak of the build is unknown; resident memory is a lower bound.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    above = max(peak if peak > peak_before else 0, resident()) - before
+    above = max(peak if peak > peak_before else 0, resident()) - resident_before
     count = mesh.num_vertices
-    print("vertices", count, "seconds", seconds, "peak", above / count, "kept", kept / count)
+    print("vertices", count, "seconds", seconds, "peak", above / count, "kept", size_of_surface / count)
 
 
 TABLES = dict(apply=apply_table, step=step_table, reverse=reverse_table, order=order_table, build=build_table)

@@ -1,13 +1,13 @@
-"""Error against wall time of every solver choice, and of what a user would write otherwise: Markdown tables, a picture.
+"""Error against time of all solvers, and of what a user would write otherwise: Markdown tables, and a picture.
 
 python benchmarks/time_to_accuracy.py [--meshes 10000 40000 160000 spot] [--problems heat schnakenberg] [--picture FILE]
 
-All contestants step the same semi-discrete system (the finite element one its own matrices of the same problem), and
-errors are relative to a solution of it at tolerances no contestant uses, so that only time is measured. Seconds are of
-the second call, compiling and factorising for the first time apart; a factorisation that belongs to a step size is part
-of the run. The last two columns are the seconds to a relative error of 1e-3, interpolated between runs (of a contestant
-all of whose runs are better its quickest, with a "<"), and their ratio to those of the default, `solve` without a
-solver: above one that is slower. Peers come with the extra `bench`; one that is missing is left out.
+All contestants solve the same semi-discrete system, except the finite element codes, which use their own matrices for
+the same problem. Errors are relative to a solution of the same system at much smaller tolerances, so they are errors in
+time only. Times are those of the second call, without compiling; a factorisation that belongs to a step size is part of
+the run. The last two columns are the seconds to a relative error of 1e-3, interpolated between runs, and their ratio to
+those of the default, `solve` without a solver (above one is slower). If all runs of a contestant are more accurate, its
+fastest run is given with a "<". The extra `bench` installs the other packages; missing ones are omitted.
 """
 
 import argparse
@@ -35,31 +35,31 @@ import ltljax as ltl  # noqa: E402
 LEVELS = {"10000": 5, "40000": 6, "160000": 7}
 SPOT = Path(__file__).parents[2] / "shared" / "meshes" / "spot.obj"
 TOLERANCES = (1e-3, 1e-5, 1e-7)
-# A contestant that took longer is not asked for more accuracy, and with half as long not for more vertices.
+# Seconds. A contestant that takes longer does not run at higher accuracy, and at half of this not on a larger mesh.
 PATIENCE = 40.0
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--meshes", nargs="+", default=list(LEVELS), choices=[*LEVELS, "spot"])
-    parser.add_argument("--spot", default=SPOT, help="where the mesh of that name is")
+    parser.add_argument("--spot", default=SPOT, help="path of the mesh named spot")
     parser.add_argument("--problems", nargs="+", default=("heat", "schnakenberg"), choices=sorted(PROBLEMS))
     parser.add_argument("--picture", help="a PNG to draw error over time into")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    found = {}
+    tables = {}
     for name in arguments.problems:
         smaller = {}
         for size in arguments.meshes:
             if size == "spot":
                 mesh = ltl.load_mesh(arguments.spot)
                 mesh = mesh.scaled(np.sqrt(4 * np.pi / mesh.area))
-                found[f"{name} on Spot", mesh.num_vertices] = table(f"{name} on Spot", PROBLEMS[name](mesh), {})
+                tables[f"{name} on Spot", mesh.num_vertices] = table(f"{name} on Spot", PROBLEMS[name](mesh), {})
             else:
                 problem = PROBLEMS[name](ltl.shapes.jittered_sphere(LEVELS[size], 0.3, seed=0))
-                smaller = found[name, problem.surface.num_vertices] = table(name, problem, smaller)
+                smaller = tables[name, problem.surface.num_vertices] = table(name, problem, smaller)
     if arguments.picture:
-        draw(found, arguments.picture)
+        draw(tables, arguments.picture)
 
 
 class Problem:
@@ -77,13 +77,12 @@ def heat(mesh):
     x = mesh.vertices
     u0 = np.exp(-8 * ((x - x[0]) ** 2).sum(axis=1)) + 0.2 * np.sin(9 * x[:, 1])
     source = x[:, 0]
-    return Problem(
-        mesh, ltl.Diffusion(source=jnp.asarray(source)), u0, 0.5, lambda u: source, (0.05, 0.01, 0.002)
-    )  # fmt: skip
+    equation = ltl.Diffusion(source=jnp.asarray(source))
+    return Problem(mesh, equation, u0, 0.5, lambda u: source, (0.05, 0.01, 0.002))
 
 
 def schnakenberg(mesh):
-    """A pattern that grows from noise and settles: gamma 100, a .1, b .9, diffusivities 1 and 10."""
+    """A pattern that grows from noise to a stationary state: gamma 100, a 0.1, b 0.9, diffusivities 1 and 10."""
 
     def rates(species, p):
         u, v = species
@@ -109,36 +108,17 @@ FIXED = {"SBDF2": ltl.SBDF2(), "CrankNicolson": ltl.CrankNicolson()}
 
 
 def table(name, problem, smaller):
-    """Print one table; rows by contestant, for the picture. ``smaller`` is that of the mesh before."""
+    """Print a table and return its runs (error, seconds) by contestant; ``smaller`` holds those of a smaller mesh."""
     size = problem.surface.num_vertices
     print(f"\n### {name}, {size} vertices, to t = {problem.t1}: relative error (seconds)\n")
-    reference = np.asarray(ours(problem, diffrax.Kvaerno5(), rtol=1e-9, atol=1e-10)[0])
-    contestants = {
-        label: [lambda tol=tol, s=solver: ours(problem, s, rtol=tol, atol=0.1 * tol) for tol in TOLERANCES]
-        for label, solver in ADAPTIVE.items()
-    }
-    for label, solver in FIXED.items():
-        contestants[label] = [
-            lambda dt=dt, s=solver: ours(problem, s, dt=dt, rtol=1e-6, atol=1e-8) for dt in problem.fixed
-        ]
-    contestants["SciPy BDF"] = [lambda tol=tol: scipy_ivp(problem, "BDF", tol) for tol in TOLERANCES]
-    contestants["SciPy Radau"] = [lambda tol=tol: scipy_ivp(problem, "Radau", tol) for tol in TOLERANCES]
-    contestants["SuperLU, SBDF2"] = [lambda dt=dt: superlu(problem, dt) for dt in problem.fixed]
-    # Finite element systems have an error of their own in space: what is compared is their own fine solution.
-    references = {}
-    finest = problem.fixed[-1] / 4
-    if name == "heat" and importlib.util.find_spec("igl"):
-        label = "libigl, backward Euler"
-        contestants[label] = [lambda dt=dt: libigl_heat(problem, dt) for dt in problem.fixed]
-        references[label] = libigl_heat(problem, finest, implicit=0.5)[0]
-    if name == "heat" and importlib.util.find_spec("ngsolve"):
-        label = "NGSolve, Crank-Nicolson"
-        contestants[label] = [lambda dt=dt: ngsolve_heat(problem, dt) for dt in problem.fixed]
-        references[label] = ngsolve_heat(problem, finest)[0]
-    print("| solver | coarse | middle | fine | compile (s) | to 1e-3 | of the default's |\n" + "| --- " * 7 + "|")
+    exact = np.asarray(ours(problem, diffrax.Kvaerno5(), rtol=1e-9, atol=1e-10)[0])
+    contestants = {label: (runs, exact) for label, runs in contestants_of(problem).items()}
+    if name == "heat":
+        contestants |= finite_elements_of(problem)
+    print("| solver | coarse | middle | fine | compile (s) | to 1e-3 (s) | over the default |\n" + "| --- " * 7 + "|")
     default = None
     rows = {}
-    for label, runs in contestants.items():
+    for label, (runs, exact) in contestants.items():
         rows[label], cells, compiling = [], [], 0.0
         is_slow = min((seconds for _, seconds in smaller.get(label, [(0, 0.0)])), default=PATIENCE) > PATIENCE / 2
         for run in runs:
@@ -147,10 +127,9 @@ def table(name, problem, smaller):
                 continue
             try:
                 u, seconds, first = run()
-            except (ltl.SolveError, MemoryError) as error:
-                cells.append(type(error).__name__)
+            except (ltl.SolveError, MemoryError) as failure:
+                cells.append(type(failure).__name__)
                 continue
-            exact = references.get(label, reference)
             error = float(np.linalg.norm(u - exact) / np.linalg.norm(exact))
             rows[label].append((error, seconds))
             cells.append(f"{error:.1e} ({seconds:.2f})")
@@ -162,11 +141,39 @@ def table(name, problem, smaller):
     return rows
 
 
+def contestants_of(problem):
+    """The runs of each contestant on the same matrix, from coarse to fine."""
+    contestants = {
+        label: [lambda tol=tol, s=solver: ours(problem, s, rtol=tol, atol=0.1 * tol) for tol in TOLERANCES]
+        for label, solver in ADAPTIVE.items()
+    }
+    for label, solver in FIXED.items():
+        contestants[label] = [
+            lambda dt=dt, s=solver: ours(problem, s, dt=dt, rtol=1e-6, atol=1e-8) for dt in problem.fixed
+        ]
+    contestants["SciPy BDF"] = [lambda tol=tol: scipy_ivp(problem, "BDF", tol) for tol in TOLERANCES]
+    contestants["SciPy Radau"] = [lambda tol=tol: scipy_ivp(problem, "Radau", tol) for tol in TOLERANCES]
+    contestants["SuperLU, SBDF2"] = [lambda dt=dt: superlu(problem, dt) for dt in problem.fixed]
+    return contestants
+
+
+def finite_elements_of(problem):
+    """The runs of finite element codes, each with a fine solution of its own matrices, whose error in space differs."""
+    contestants, finest = {}, problem.fixed[-1] / 4
+    if importlib.util.find_spec("igl"):
+        runs = [lambda dt=dt: libigl_heat(problem, dt) for dt in problem.fixed]
+        contestants["libigl, backward Euler"] = runs, libigl_heat(problem, finest, implicit=0.5)[0]
+    if importlib.util.find_spec("ngsolve"):
+        runs = [lambda dt=dt: ngsolve_heat(problem, dt) for dt in problem.fixed]
+        contestants["NGSolve, Crank-Nicolson"] = runs, ngsolve_heat(problem, finest)[0]
+    return contestants
+
+
 def to_accuracy(runs, goal=1e-3):
-    """The seconds to a relative error, and "<" where the coarsest run is better already; infinite where none is."""
+    """The seconds to a relative error, after "<" if the coarsest run is already better; infinite if no run is."""
     if not runs or min(error for error, _ in runs) > goal:
         return "", np.inf
-    # As a user would find it: the quickest run that is good enough, or between that and one that is not.
+    # Interpolate between the fastest run that is accurate enough and a faster one that is not.
     good = min((run for run in runs if run[0] <= goal), key=lambda run: run[1])
     worse = [run for run in runs if run[0] > goal and run[1] < good[1]]
     if not worse:
@@ -176,9 +183,10 @@ def to_accuracy(runs, goal=1e-3):
     return "", float(np.exp((1 - share) * np.log(near[1]) + share * np.log(good[1])))
 
 
-def ours(problem, solver, **how):
+def ours(problem, solver, **options):
+    """The last state, the seconds of the second call, and the seconds of the first call."""
     start = time.perf_counter()
-    run = lambda: ltl.solve(problem.equation, problem.surface, problem.u0, problem.t1, solver=solver, **how)  # noqa: E731
+    run = lambda: ltl.solve(problem.equation, problem.surface, problem.u0, problem.t1, solver=solver, **options)  # noqa: E731
     us = jax.block_until_ready(run().us)
     seconds = first = time.perf_counter() - start
     if first < PATIENCE:
@@ -189,7 +197,7 @@ def ours(problem, solver, **how):
 
 
 def scipy_ivp(problem, method, tolerance):
-    """`solve_ivp` with the sparse Jacobian of the diffusion and the pointwise one of the reaction."""
+    """`solve_ivp` with the sparse Jacobian of diffusion and reaction."""
     shape = problem.u0.shape
     diffusivities = np.atleast_1d(np.asarray(problem.equation.diffusivity))
     diffusion = scipy.sparse.block_diag([d * problem.laplacian for d in diffusivities], format="csc")
@@ -210,37 +218,38 @@ def scipy_ivp(problem, method, tolerance):
         return scipy.sparse.csc_matrix(diffusion + scipy.sparse.bmat(parts))
 
     start = time.perf_counter()
-    found = scipy.integrate.solve_ivp(
+    solution = scipy.integrate.solve_ivp(
         rate, (0, problem.t1), flat(problem.u0), method=method, jac=jacobian, rtol=tolerance, atol=0.1 * tolerance,
         t_eval=[problem.t1],
     )  # fmt: skip
     seconds = time.perf_counter() - start
-    return field(found.y[:, -1]), seconds, seconds
+    return field(solution.y[:, -1]), seconds, seconds
 
 
 def superlu(problem, dt):
-    """SBDF2 with one factorisation for each diffusivity."""
+    """SBDF2 with one factorisation per diffusivity and step size."""
     shape = problem.u0.shape
     start = time.perf_counter()
     diffusivities = np.broadcast_to(np.atleast_1d(np.asarray(problem.equation.diffusivity)), shape[1:] or (1,))
     eye = scipy.sparse.eye(len(problem.mesh.vertices), format="csc")
     first = [scipy.sparse.linalg.splu(eye - dt * d * problem.laplacian) for d in diffusivities]
-    then = [scipy.sparse.linalg.splu(1.5 * eye - dt * d * problem.laplacian) for d in diffusivities]
-    solve = lambda factors, right: np.stack(  # noqa: E731
-        [f.solve(np.ascontiguousarray(column)) for f, column in zip(factors, right.T, strict=True)], axis=1
+    later = [scipy.sparse.linalg.splu(1.5 * eye - dt * d * problem.laplacian) for d in diffusivities]
+    solve = lambda factors, b: np.stack(  # noqa: E731
+        [f.solve(np.ascontiguousarray(column)) for f, column in zip(factors, b.T, strict=True)], axis=1
     )
     u, explicit = problem.u0.reshape(eye.shape[0], -1), lambda u: problem.explicit(u.reshape(shape)).reshape(u.shape)
-    before, mild_before = u, explicit(u)
-    u = solve(first, u + dt * mild_before)
+    previous, previous_rate = u, explicit(u)
+    u = solve(first, u + dt * previous_rate)
     for _ in range(round(problem.t1 / dt) - 1):
-        mild = explicit(u)
-        u, before, mild_before = solve(then, 2 * u - before / 2 + dt * (2 * mild - mild_before)), u, mild
+        rate = explicit(u)
+        right_hand_side = 2 * u - previous / 2 + dt * (2 * rate - previous_rate)
+        u, previous, previous_rate = solve(later, right_hand_side), u, rate
     seconds = time.perf_counter() - start
     return u.reshape(shape), seconds, seconds
 
 
 def libigl_heat(problem, dt, implicit=1.0):
-    """The cotangent Laplacian and lumped masses, one symmetric factorisation for all steps."""
+    """The cotangent Laplacian with lumped masses, and one symmetric factorisation for all steps."""
     import igl
 
     vertices, faces = np.asarray(problem.mesh.vertices, np.float64), np.asarray(problem.mesh.faces, np.int64)
@@ -284,26 +293,27 @@ def ngsolve_heat(problem, dt):
     system = mass.mat.CreateMatrix()
     system.AsVector().data = mass.mat.AsVector() + dt / 2 * stiffness.mat.AsVector()
     inverse = system.Inverse(freedofs=space.FreeDofs(), inverse="sparsecholesky")
-    rest = state.vec.CreateVector()
+    residual = state.vec.CreateVector()
     for _ in range(round(problem.t1 / dt)):
-        rest.data = dt * source.vec - dt * stiffness.mat * state.vec
-        state.vec.data += inverse * rest
+        residual.data = dt * source.vec - dt * stiffness.mat * state.vec
+        state.vec.data += inverse * residual
     seconds = time.perf_counter() - start
     return np.array(state.vec.FV().NumPy()), seconds, seconds
 
 
-def draw(found, path):
+def draw(tables, path):
+    """Draw error over time, one panel per table."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     columns = 3
-    rows = len(found) // columns + 1
+    rows = len(tables) // columns + 1
     figure, axes = plt.subplots(rows, columns, figsize=(4.6 * columns, 4 * rows), squeeze=False)
-    labels = list(dict.fromkeys(label for contestants in found.values() for label in contestants))
+    labels = list(dict.fromkeys(label for contestants in tables.values() for label in contestants))
     colors = dict(zip(labels, plt.get_cmap("tab20").colors[::2] + plt.get_cmap("tab20").colors[1::2], strict=False))
-    for axis, ((name, size), contestants) in zip(axes.flat, found.items(), strict=False):
+    for axis, ((name, size), contestants) in zip(axes.flat, tables.items(), strict=False):
         for label, points in contestants.items():
             style = "-o" if label in ADAPTIVE or label in FIXED else "--s"
             axis.loglog(
@@ -311,7 +321,7 @@ def draw(found, path):
             )
         axis.set(title=f"{name}, {size} vertices", xlabel="seconds", ylabel="relative error")
         axis.grid(alpha=0.3)
-    for axis in axes.flat[len(found) :]:
+    for axis in axes.flat[len(tables) :]:
         axis.axis("off")
     for label in labels:
         style = "-o" if label in ADAPTIVE or label in FIXED else "--s"

@@ -1,12 +1,12 @@
 """A slow NumPy transcription of Chen, Chi and Wu, "A new intrinsic numerical method for PDE on surfaces".
 
 The paper is arXiv 0907.1817 (2009), and all formulas are from its Section 2. Each function handles one vertex at a time
-and was written from the formulas alone, without reading the package, so that the tests can hold `ltl.Paper()` to an
+and was written from the formulas alone, without reading the package, so that the tests compare `ltl.Paper()` with an
 independent implementation.
 
 In all functions `vertices` is an array (V, 3), `faces` is an array (F, 3), and all faces have the same orientation.
-`angles` (V,) turns the basis used in each tangent plane, which changes no result. `at` lists the vertices to evaluate
-the operator at, by default all of them; the result is NaN at every other vertex.
+`angles` (V,) rotates the basis used in each tangent plane, which changes no result. `at` lists the vertices at which
+the operator is evaluated, by default all of them; the result is NaN at every other vertex.
 """
 
 import numpy as np
@@ -37,9 +37,9 @@ def normal(vertices, v, pairs):
 
 
 def basis(n, angle=0.0):
-    """Orthonormal basis (2, 3) of the plane orthogonal to the unit vector n, turned by `angle` about n.
+    """Orthonormal basis (2, 3) of the plane orthogonal to the unit vector n, rotated by `angle` about n.
 
-    The paper allows any basis of TS(v) (Section 2), and no result depends on which is used.
+    The paper allows any basis of TS(v) (Section 2), and no result depends on the choice.
     """
     axis = np.eye(3)[np.argmin(np.abs(n))]
     e1 = np.cross(n, axis)
@@ -97,8 +97,8 @@ def transport(edge, normal_from, normal_to, X):
 
         L(a e1~ + b e2~) = a e1 + b e2.
 
-    A part of X normal to TS(v_i) is dropped. In general L is not the shortest rotation of N(v_i) to N(v). The two agree
-    only if the edge lies in the plane that the two normals span.
+    The component of X normal to TS(v_i) is dropped. In general L is not the shortest rotation of N(v_i) to N(v). The
+    two agree only if the edge lies in the plane spanned by the two normals.
     """
     e1_from, e2_from = edge_basis(edge, normal_from)
     e1, e2 = edge_basis(edge, normal_to)

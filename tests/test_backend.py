@@ -1,7 +1,7 @@
-"""A self-check of the backend: some releases of jaxlib return wrong results for jit(vmap(...)), or none.
+"""A self-check of the backend, because some releases of jaxlib return wrong results for jit(vmap(...)), or hang.
 
-jax-ml/jax#39103: wrong results for padded gathers, jaxlib 0.10.2 on CPU, silently; the releases known to do so are
-excluded in pyproject.toml. Batched fits that never end: jaxlib 0.10.1.
+jaxlib 0.10.2 silently returns wrong results for padded gathers on CPU (jax-ml/jax#39103), and jaxlib 0.10.1 hangs in
+batched fits. The releases known to return wrong results are excluded in pyproject.toml.
 """
 
 import os
@@ -24,9 +24,9 @@ def case(request):
     return surface, ltl.laplacian_matrix(surface)
 
 
-def assert_equal(found, expected, surface):
+def assert_equal(actual, expected, surface):
     tolerance = 20 * jnp.finfo(surface.dtype).eps
-    np.testing.assert_allclose(found, expected, rtol=0, atol=float(tolerance * np.abs(expected).max()))
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=float(tolerance * np.abs(expected).max()))
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -47,27 +47,28 @@ def test_batched_gradients_equal_the_transposed_matrix(case, width):
     surface, matrix = case
     batch = np.random.default_rng(width).normal(size=(width, surface.num_vertices)).astype(surface.dtype)
     energy = jax.grad(lambda u: jnp.sum(ltl.laplacian(surface, u) ** 2) / 2)
-    found = jax.jit(jax.vmap(energy))(jnp.asarray(batch))
-    assert_equal(found, (matrix.T @ (matrix @ batch.T)).T, surface)
+    gradients = jax.jit(jax.vmap(energy))(jnp.asarray(batch))
+    assert_equal(gradients, (matrix.T @ (matrix @ batch.T)).T, surface)
 
 
 def test_the_jacobian_is_the_matrix(case):
     surface, matrix = case
     u = jnp.zeros(surface.num_vertices, surface.dtype)
     for jacobian in (jax.jacfwd, jax.jacrev):
-        found = jax.jit(jacobian(lambda u: ltl.laplacian(surface, u)))(u)
-        assert_equal(found, matrix.todense(), surface)
+        dense = jax.jit(jacobian(lambda u: ltl.laplacian(surface, u)))(u)
+        assert_equal(dense, matrix.todense(), surface)
 
 
-def test_batched_fits_end():
-    """At the size at which jaxlib 0.10.1 waits for ever under its default schedule; in a process that can be ended."""
+def test_batched_fits_terminate():
+    """Runs at the size at which jaxlib 0.10.1 hangs under its default schedule, in a process with a time limit."""
     program = """
 import jax.numpy as jnp, numpy as np, ltljax as ltl
 x = np.linspace(0, 3, 3855)
 model = lambda p: jnp.sin(p["a"] * x) + p["b"] * x + jnp.exp(-p["d"] * x)
 truth = dict(a=1.0, b=2.0, d=0.5)
 starts = {key: value * np.linspace(0.8, 1.2, 8) for key, value in truth.items()}
-found = ltl.inverse.fit_many(model, starts, ltl.Observations(np.asarray(model(truth)), 0.1), transforms=ltl.inverse.Positive())
-assert found.losses.max() < 1e-3, found.losses
+data = ltl.Observations(np.asarray(model(truth)), 0.1)
+fits = ltl.inverse.fit_many(model, starts, data, transforms=ltl.inverse.Positive())
+assert fits.losses.max() < 1e-3, fits.losses
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=100, env=os.environ | {"JAX_ENABLE_X64": "1"})

@@ -1,17 +1,17 @@
-"""`ltl.Monotone()`: consistent, never negative, stable, and as accurate as measured before."""
+"""`ltl.Monotone()` is consistent, non-negative and stable, and as accurate as measured before."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse
 import scipy.sparse.linalg
+from scipy.sparse.linalg import expm_multiply
 from scipy.special import j0
 
 import ltljax as ltl
 from ltljax._operators import spectral_bound
 
-# Of real meshes, which have a few.
+# Real meshes have a few inconsistent rows.
 pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 
 SPHERES = {
@@ -26,8 +26,8 @@ FAMILIES = {
     "hemisphere": lambda: ltl.shapes.hemisphere(rings=12),
     "cylinder": lambda: ltl.shapes.cylinder(),
 }
-# The table of errors on the unit sphere with 2562 vertices that the operator was designed by, relative L2: heat flow
-# to t = 0.1, and in percent the eigenvalues of l = 1, 3 and 5, each a mean over its multiplet.
+# Measured errors on the unit sphere with 2562 vertices: the relative L2 error of heat flow to t = 0.1, and the errors
+# (in percent) of the eigenvalues for l = 1, 3 and 5, each a mean over its multiplet.
 HEAT = {
     ("icosphere", "projection"): 5.1e-4,
     ("jittered", "projection"): 6.5e-4,
@@ -47,8 +47,8 @@ EIGENVALUES = {
 }
 
 
-def relative(found, exact):
-    return float(np.linalg.norm(np.asarray(found) - exact) / np.linalg.norm(exact))
+def relative_error(approximation, exact):
+    return float(np.linalg.norm(np.asarray(approximation) - exact) / np.linalg.norm(exact))
 
 
 def harmonics(vertices):
@@ -71,8 +71,8 @@ def test_heat_on_spheres_is_as_accurate_as_measured_before(sphere, lift):
     mesh = SPHERES[sphere]()
     surface = ltl.Surface.from_mesh(mesh, ltl.Monotone(lift=lift))
     e2, e3 = harmonics(mesh.vertices)
-    solution = ltl.solve(ltl.Diffusion(), surface, jnp.asarray(e2 + e3), 0.1, rtol=1e-9, atol=1e-11)
-    error = relative(solution.us[-1], e2 * np.exp(-0.6) + e3 * np.exp(-1.2))
+    u = expm_multiply(0.1 * ltl.laplacian_matrix(surface), e2 + e3)
+    error = relative_error(u, e2 * np.exp(-0.6) + e3 * np.exp(-1.2))
     assert error == pytest.approx(HEAT[sphere, lift], rel=0.2)
 
 
@@ -80,9 +80,9 @@ def test_heat_on_spheres_is_as_accurate_as_measured_before(sphere, lift):
 def test_eigenvalues_of_spheres_are_as_accurate_as_measured_before(sphere, lift):
     surface = ltl.Surface.from_mesh(SPHERES[sphere](), ltl.Monotone(lift=lift))
     matrix = -ltl.laplacian_matrix(surface).tocsc()
-    found = scipy.sparse.linalg.eigs(matrix, k=40, sigma=-0.5, return_eigenvectors=False)
-    assert (np.abs(found.imag) < 0.01 * np.abs(found) + 1e-8).all()
-    values = np.sort(found.real)
+    eigenvalues = scipy.sparse.linalg.eigs(matrix, k=40, sigma=-0.5, return_eigenvectors=False)
+    assert (np.abs(eigenvalues.imag) < 0.01 * np.abs(eigenvalues) + 1e-8).all()
+    values = np.sort(eigenvalues.real)
     assert abs(values[0]) < 1e-8
     for degree, expected in zip((1, 3, 5), EIGENVALUES[sphere, lift], strict=True):
         error = 100 * abs(values[degree**2 : (degree + 1) ** 2].mean() / (degree * (degree + 1)) - 1)
@@ -102,11 +102,11 @@ def test_the_pointwise_laplacian_is_close_on_irregular_spheres(sphere, lift, bou
     mesh = SPHERES[sphere]()
     e2, e3 = harmonics(mesh.vertices)
     surface = ltl.Surface.from_mesh(mesh, ltl.Monotone(lift=lift))
-    assert relative(ltl.laplacian(surface, e2 + e3), -6 * e2 - 12 * e3) < bound
+    assert relative_error(ltl.laplacian(surface, e2 + e3), -6 * e2 - 12 * e3) < bound
 
 
 @pytest.mark.parametrize("lift", ["intrinsic", "chord", "projection"])
-def test_orders_on_jittered_spheres(lift):
+def test_normals_and_gradient_are_second_order_and_the_laplacian_first_order_on_jittered_spheres(lift):
     errors = {"normals": [], "gradient": [], "laplacian": []}
     for level in (3, 4, 5):
         mesh = ltl.shapes.jittered_sphere(level, 0.3, seed=0)
@@ -115,9 +115,9 @@ def test_orders_on_jittered_spheres(lift):
         e2, e3 = harmonics(mesh.vertices)
         gradient = np.stack([y * z + x, x * z - y, x * y], axis=1)
         gradient -= np.sum(gradient * mesh.vertices, axis=1, keepdims=True) * mesh.vertices
-        errors["normals"].append(relative(surface.normals, mesh.vertices))
-        errors["gradient"].append(relative(ltl.gradient(surface, e2 + e3), gradient))
-        errors["laplacian"].append(relative(ltl.laplacian(surface, e2 + e3), -6 * e2 - 12 * e3))
+        errors["normals"].append(relative_error(surface.normals, mesh.vertices))
+        errors["gradient"].append(relative_error(ltl.gradient(surface, e2 + e3), gradient))
+        errors["laplacian"].append(relative_error(ltl.laplacian(surface, e2 + e3), -6 * e2 - 12 * e3))
     order = {name: np.log2(e[0] / e[2]) / 2 for name, e in errors.items()}
     assert order["normals"] > 1.8
     assert order["gradient"] > 1.8
@@ -134,26 +134,29 @@ def test_heat_in_an_insulated_disk_is_second_order():
         mesh = ltl.shapes.jittered(ltl.shapes.disk(rings=rings), 0.2, seed=0)
         surface = ltl.Surface.from_mesh(mesh)
         start = j0(zero * np.hypot(*mesh.vertices[:, :2].T))
-        u = ltl.solve(ltl.Diffusion(), surface, start, 0.1, rtol=1e-8, atol=1e-10).us[-1]
-        errors.append(relative(u, start * np.exp(-(zero**2) * 0.1)))
+        u = expm_multiply(0.1 * ltl.laplacian_matrix(surface), start)
+        errors.append(relative_error(u, start * np.exp(-(zero**2) * 0.1)))
+        if rings == 10:
+            solution = ltl.solve(ltl.Diffusion(), surface, start, 0.1, rtol=1e-8, atol=1e-10)
+            assert relative_error(solution.us[-1], u) < 1e-5
     assert np.log2(errors[0] / errors[2]) / 2 > 1.8
     assert errors[-1] < 2e-3
 
 
 @pytest.mark.parametrize("scheme", [ltl.Monotone(), ltl.Monotone(lift="projection")])
-def test_quadratics_are_differentiated_exactly_in_the_plane(scheme):
+def test_quadratics_in_the_plane_are_differentiated_exactly(scheme):
     mesh = ltl.shapes.jittered(ltl.shapes.square(n=12), 0.3, seed=0)
     surface = ltl.Surface.from_mesh(mesh, scheme)
     x, y, _ = mesh.vertices.T
     u = 2 * x**2 - 3 * x * y + 0.5 * y**2 + x - y
-    inside = ~mesh.boundary_vertices
-    np.testing.assert_allclose(np.asarray(ltl.laplacian(surface, u))[inside], 5, atol=1e-9)
+    is_interior = ~mesh.boundary_vertices
+    np.testing.assert_allclose(np.asarray(ltl.laplacian(surface, u))[is_interior], 5, atol=1e-9)
     gradient = np.stack([4 * x - 3 * y + 1, -3 * x + y - 1, 0 * x], axis=1)
     np.testing.assert_allclose(ltl.gradient(surface, u), gradient, atol=1e-10)
 
 
 def torus_spectrum():
-    """The published eigenvalues of -Delta on the torus of radii 2 and 1, with their multiplicities."""
+    """The published eigenvalues of -Delta on the torus with radii 2 and 1, repeated by multiplicity."""
     simple = {0.9767313135: 1, 1.1222882712: 1}
     double = [0.2493680569, 0.7945678016, 1.2637169467, 1.5451508277, 1.6630145377, 2.0406181488]
     return np.sort(np.repeat([*simple, *double], [*simple.values(), *[2] * len(double)]))
@@ -164,10 +167,9 @@ def torus_spectrum():
 def test_eigenvalues_of_the_torus_have_the_right_values_and_multiplicities(amount, lift):
     surface = ltl.Surface.from_mesh(ltl.shapes.jittered_torus(96, 48, amount, seed=0), ltl.Monotone(lift=lift))
     exact = torus_spectrum()
-    found = scipy.sparse.linalg.eigs(
-        -ltl.laplacian_matrix(surface).tocsc(), k=24, sigma=-0.05, return_eigenvectors=False
-    )
-    values = np.sort(found.real)[: len(exact) + 1]
+    matrix = -ltl.laplacian_matrix(surface).tocsc()
+    eigenvalues = scipy.sparse.linalg.eigs(matrix, k=24, sigma=-0.05, return_eigenvectors=False)
+    values = np.sort(eigenvalues.real)[: len(exact) + 1]
     assert abs(values[0]) < 1e-8
     np.testing.assert_allclose(values[1:], exact, rtol=5e-3)
 
@@ -182,7 +184,7 @@ def test_eigenvalues_of_spheres_have_the_right_multiplicities(sphere):
     assert values[16] > 18
 
 
-def stable_mesh(name, real_mesh):
+def mesh_named(name, real_mesh):
     if name.endswith("obj"):
         return ltl.load_mesh(real_mesh(name))
     small = {
@@ -217,20 +219,20 @@ SMALL += ["disk", "hemisphere", "square", "cylinder", "spot_low.obj", "hand_open
     ],
 )
 def test_no_mode_grows(name, real_mesh):
-    surface = ltl.Surface.from_mesh(stable_mesh(name, real_mesh))
+    surface = ltl.Surface.from_mesh(mesh_named(name, real_mesh))
     eigenvalues = np.linalg.eigvals(ltl.laplacian_matrix(surface).todense())
     assert eigenvalues.real.max() < 1e-10 * np.abs(eigenvalues).max()
 
 
 @pytest.mark.parametrize("name", ["spot.obj", "armadillo.obj", "stanford_bunny.obj", "jittered torus of 3000"])
 def test_no_mode_grows_on_large_meshes(name, real_mesh):
-    surface = ltl.Surface.from_mesh(stable_mesh(name, real_mesh))
+    surface = ltl.Surface.from_mesh(mesh_named(name, real_mesh))
     assert ltl.operators.growth_rate(surface) < 1e-10 * float(spectral_bound(surface))
 
 
 @pytest.mark.parametrize("name", ["random", "spot_low.obj", "jittered torus", "hand_open.obj"])
 def test_implicit_diffusion_keeps_the_maximum_principle(name, real_mesh):
-    surface = ltl.Surface.from_mesh(stable_mesh(name, real_mesh))
+    surface = ltl.Surface.from_mesh(mesh_named(name, real_mesh))
     matrix = ltl.laplacian_matrix(surface).tocsc()
     random = np.random.default_rng(0)
     identity = scipy.sparse.eye_array(surface.num_vertices, format="csc")
@@ -244,7 +246,7 @@ def test_implicit_diffusion_keeps_the_maximum_principle(name, real_mesh):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["stanford_bunny.obj", "armadillo.obj"])
-def test_eigenvalues_of_scans_are_near_those_of_finite_elements(name, real_mesh):
+def test_eigenvalues_of_scans_are_close_to_finite_elements(name, real_mesh):
     import robust_laplacian
 
     mesh = ltl.load_mesh(real_mesh(name))
@@ -267,11 +269,11 @@ def test_inconsistent_rows_of_real_meshes_are_rare_and_counted(name, at_most, re
     assert f"{len(report.inconsistent)}" in str(report).split("inconsistent Laplacian rows")[1].split("\n")[0]
 
 
-def test_the_mesh_size_of_a_closed_surface_is_that_of_its_mesh():
+def test_a_closed_surface_has_the_mesh_size_of_its_mesh_and_differentiates_it():
     mesh = ltl.shapes.jittered_sphere(2, 0.4)
     surface = ltl.Surface.from_mesh(mesh)
     np.testing.assert_allclose(surface.mesh_size, mesh.mesh_size, rtol=1e-12)
-    # A number where only something else is traced, and traced with the vertices.
+    # The mesh size is concrete unless the vertices are traced.
     assert jax.jit(lambda x: float(surface.mesh_size) * x)(1.0) == surface.mesh_size
     x = surface.vertices
     slope = jax.jit(jax.grad(lambda s: surface.with_vertices(s * x).mesh_size))(1.0)

@@ -1,7 +1,7 @@
 """The method: from vertex positions to weights.
 
-What enters: positions, and the frozen topology (which neighbours a row uses). What leaves: normals, tangent frames, the
+Inputs: positions, and the frozen topology (which neighbours each row uses). Outputs: normals, tangent frames, the
 lifted neighbours of every vertex, and the weights of the gradient and the Laplacian on them, as pure functions of the
-positions. Three host files choose what is frozen: `delaunay` the flips of the intrinsic triangulation, `charts` and
-`support` the neighbours of every row.
+positions. Three modules run on the host and choose the frozen topology: `delaunay` chooses the edge flips of the
+intrinsic triangulation, `charts` and `support` choose the neighbours of every row.
 """

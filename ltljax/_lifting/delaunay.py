@@ -1,7 +1,7 @@
-"""Which flips make a triangulation intrinsically Delaunay: chosen once, on the host, from the positions.
+"""The edge flips that make a triangulation intrinsically Delaunay, chosen once on the host.
 
-What enters: the faces, the table of one-rings and the positions. What leaves: the flips that lead to the intrinsic
-Delaunay triangulation, and the connectivity of its half-edges (`HalfEdges`).
+Inputs: the faces, the table of one-rings and the positions. Outputs: the flips that lead to the intrinsic Delaunay
+triangulation, and the connectivity of its half-edges (`HalfEdges`).
 
 Source: Bobenko and Springborn (2007), A discrete Laplace-Beltrami operator for simplicial surfaces,
 doi:10.1007/s00454-007-9006-1.
@@ -15,7 +15,8 @@ from .._tables import Table
 from .intrinsic import Flips, RingAngles, Triangulation, corner_angle, flip, flipped, ring_angles
 from .ring import RingTopology
 
-# Two angles opposite an edge may exceed pi by this much: the diagonals of a square tie, and rounding decides nothing.
+# An edge is flipped only if its opposite angles exceed pi by more than this, so that rounding never flips the diagonal
+# of a square.
 _TIE = 1e-9
 
 
@@ -24,10 +25,11 @@ class HalfEdges:
     """The half-edges of a triangulation (host).
 
     Attributes:
-        following: (H,) the next half-edge of the same face; -1 where there is no face.
-        tails: (H,) the vertex at which each begins.
-        lengths: (E,) the lengths of the edges.
-        angles: (H,) the angle of each from the first half-edge of its tail, in radians, before charts are scaled.
+        following: (H,) next half-edge of the same face; -1 if there is no face.
+        tails: (H,) vertex at which each half-edge begins.
+        lengths: (E,) lengths of the edges.
+        angles: (H,) angle between the first half-edge of the tail and this half-edge, in radians, before the angles of
+            the chart are rescaled.
     """
 
     following: np.ndarray
@@ -45,10 +47,18 @@ def delaunay_triangulation(
 ) -> tuple[Triangulation, HalfEdges, RingAngles]:
     """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
 
-    Every round flips a set of edges that do not share a face, those first whose opposite angles exceed pi the most, and
-    looks again at the edges around them. Edges between two vertices marked in ``is_folded`` (V,), which are the corners
-    of faces that are folded over and their neighbours, stay, so that no edge leads through such a face. All edges at
-    other vertices are Delaunay, which keeps the cotangent weights there non-negative.
+    Every round flips a set of edges that do not share a face, and then checks the edges around them. Edges whose
+    opposite angles exceed pi the most are flipped first.
+
+    An edge between two vertices marked in ``is_folded`` is never flipped, so that no new edge leads through a folded
+    face. All edges at other vertices become Delaunay, which keeps the cotangent weights there non-negative.
+
+    Args:
+        faces: (F, 3) the triangles.
+        vertices: (V, 3) positions.
+        ring: the one-rings.
+        ring_blocks: for every block of ``ring``, which slots hold neighbours and faces.
+        is_folded: (V,) mask of the corners of faces that are folded over, and of their neighbours.
     """
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()
@@ -60,11 +70,11 @@ def delaunay_triangulation(
     face_of[corner] = np.minimum(corner, np.minimum(following[corner], following[following[corner]]))
     levels, candidates = [], np.arange(len(ends))
     while len(candidates):
-        is_kept = is_folded[tails[2 * candidates]] & is_folded[tails[2 * candidates + 1]]
-        candidates = candidates[~is_kept]
+        is_frozen = is_folded[tails[2 * candidates]] & is_folded[tails[2 * candidates + 1]]
+        candidates = candidates[~is_frozen]
         excess = _excess(candidates, following, face_of, lengths)
-        wanting, excess = candidates[excess > _TIE], excess[excess > _TIE]
-        h = 2 * wanting[_independent(wanting, excess, face_of)]
+        violating, excess = candidates[excess > _TIE], excess[excess > _TIE]
+        h = 2 * violating[_independent(violating, excess, face_of)]
         if not len(h):
             break
         h1, t1 = following[h], following[h ^ 1]
@@ -75,13 +85,13 @@ def delaunay_triangulation(
         following[h], following[h2], following[t1] = h2, t1, h
         following[h ^ 1], following[t2], following[h1] = t2, h1, h ^ 1
         face_of[t1], face_of[h1] = face_of[h], face_of[h ^ 1]
-        candidates = np.union1d(wanting, np.concatenate([h1, h2, t1, t2]) >> 1)
+        candidates = np.union1d(violating, np.concatenate([h1, h2, t1, t2]) >> 1)
     triangulation = Triangulation(ends, flipless.slots, _in_levels(levels, len(tails)), tails.astype(np.int32))
     return triangulation, HalfEdges(following, tails, lengths, angles), mesh_angles
 
 
 def _in_levels(levels: list[np.ndarray], fill: int) -> Flips:
-    """The flips of all levels, each (5, N), made equally wide."""
+    """The flips of all levels, each (5, N), padded to a common width with ``fill``."""
     width = max((level.shape[1] for level in levels), default=0)
     padded = np.full((len(levels), 5, width), fill, np.int32)
     for row, level in zip(padded, levels, strict=True):
@@ -90,7 +100,7 @@ def _in_levels(levels: list[np.ndarray], fill: int) -> Flips:
 
 
 def _connectivity(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """The ends (E, 2) of the edges, the lower vertex first, and the next half-edge of each half-edge's face."""
+    """The ends (E, 2) of each edge, lower vertex first, and the half-edge that follows each half-edge in its face."""
     tail = faces.astype(np.int64)
     head = np.roll(tail, -1, axis=1)
     keys = np.minimum(tail, head) * num_vertices + np.maximum(tail, head)
@@ -106,7 +116,7 @@ def _connectivity(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.
 
 
 def _ring_slots(ring: Table, tails: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Where each half-edge of the mesh stands in the table of one-rings, blocks laid end to end."""
+    """The position of each half-edge of the mesh in the table of one-rings, its blocks concatenated."""
     keys, positions, start = [], [], 0
     for block in ring.blocks:
         row = np.broadcast_to(block.centre(np.arange(num_vertices)), block.indices.shape)
@@ -117,26 +127,26 @@ def _ring_slots(ring: Table, tails: np.ndarray, num_vertices: int) -> np.ndarray
     keys, positions = np.concatenate(keys), np.concatenate(positions)
     order = np.argsort(keys)
     heads = tails.reshape(-1, 2)[:, ::-1].ravel()
-    found = np.searchsorted(keys[order], tails.astype(np.int64) * num_vertices + heads)
-    return positions[order[found]].astype(np.int32)
+    ranks = np.searchsorted(keys[order], tails.astype(np.int64) * num_vertices + heads)
+    return positions[order[ranks]].astype(np.int32)
 
 
 def _excess(edges: np.ndarray, following: np.ndarray, face_of: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """By how much the angles opposite each edge exceed pi; -pi where it has not two different faces."""
+    """The sum of the two angles opposite each edge minus pi; -pi for an edge without two distinct faces."""
     h = 2 * edges
-    has_two = (following[h] >= 0) & (following[h ^ 1] >= 0) & (face_of[h] != face_of[h ^ 1])
+    has_two_faces = (following[h] >= 0) & (following[h ^ 1] >= 0) & (face_of[h] != face_of[h ^ 1])
     excess = np.full(len(edges), -np.pi)
-    own = lengths[edges[has_two]]
+    own = lengths[edges[has_two_faces]]
     total = -np.pi
-    for side in (h[has_two], h[has_two] ^ 1):
+    for side in (h[has_two_faces], h[has_two_faces] ^ 1):
         ahead = following[side]
         total = total + corner_angle(own, lengths[ahead >> 1], lengths[following[ahead] >> 1])
-    excess[has_two] = total
+    excess[has_two_faces] = total
     return excess
 
 
 def _independent(edges: np.ndarray, excess: np.ndarray, face_of: np.ndarray) -> np.ndarray:
-    """Which of the edges to flip together: those that come first, by their excess, in both of their faces."""
+    """Which edges can be flipped together: those with the largest excess in both of their faces."""
     rank = np.empty(len(edges), np.int64)
     rank[np.argsort(-excess, kind="stable")] = np.arange(len(edges))
     sides = face_of[2 * edges], face_of[2 * edges + 1]
@@ -147,10 +157,14 @@ def _independent(edges: np.ndarray, excess: np.ndarray, face_of: np.ndarray) -> 
 
 
 def opposite_edges(half_edges: HalfEdges, which: np.ndarray, none: int) -> np.ndarray:
-    """For half-edges (N,) their edge, and the other two of the faces on the left and right, (5, N); `none` without."""
-    out = [which >> 1]
+    """The edges of the two faces beside each half-edge, (5, N).
+
+    The first row is the edge of the half-edge itself. Then follow the other two edges of the face on its left and of
+    the face on its right; ``none`` where there is no face.
+    """
+    edges = [which >> 1]
     for side in (which, which ^ 1):
         ahead = half_edges.following[side]
         has_face = ahead >= 0
-        out += [np.where(has_face, ahead >> 1, none), np.where(has_face, half_edges.following[ahead] >> 1, none)]
-    return np.stack(out)
+        edges += [np.where(has_face, ahead >> 1, none), np.where(has_face, half_edges.following[ahead] >> 1, none)]
+    return np.stack(edges)

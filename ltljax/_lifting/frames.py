@@ -4,12 +4,12 @@ from jaxtyping import Float
 
 from .._tables import AnyArray
 
-# Opposite normals have no shortest rotation between them; this keeps the formula finite there.
+# There is no unique shortest rotation between opposite normals; this bound keeps the formula finite there.
 _NEARLY_OPPOSITE = 1e-9
 
 
 def unit(vectors: Float[AnyArray, "*N 3"]) -> Float[AnyArray, "*N 3"]:
-    """The vectors at length one. A vector of length zero becomes e3, with zero derivative."""
+    """The vectors divided by their lengths. A zero vector becomes e3, with zero derivative."""
     xp = vectors.__array_namespace__()
     squared = xp.sum(vectors**2, axis=-1, keepdims=True)
     is_zero = squared == 0
@@ -23,8 +23,9 @@ def unit(vectors: Float[AnyArray, "*N 3"]) -> Float[AnyArray, "*N 3"]:
 def tangent_frames(normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 2 3"]:
     """An orthonormal basis (e1, e2) of every tangent plane, with e1 x e2 = n.
 
-    The branch-free construction of Duff and others (2017), Building an orthonormal basis, revisited. The frames jump
-    where n_z changes sign; no operator depends on them.
+    The frames are discontinuous where n_z changes sign. No operator depends on the choice of frame.
+
+    Source: Duff and others (2017), Building an orthonormal basis, revisited (the branch-free construction).
     """
     xp = normals.__array_namespace__()
     x, y, z = normals[:, 0], normals[:, 1], normals[:, 2]
@@ -39,13 +40,18 @@ def tangent_frames(normals: Float[AnyArray, "N 3"]) -> Float[AnyArray, "N 2 3"]:
 def boundary_frames(
     normals: Float[AnyArray, "N 3"], to_next: Float[AnyArray, "N 3"], to_previous: Float[AnyArray, "N 3"]
 ) -> Float[AnyArray, "N 2 3"]:
-    """Frames whose second vector is the outward conormal, from the offsets to the two neighbours along the boundary.
+    """Frames whose second vector is the outward conormal.
 
-    The tangent of the boundary is that of the parabola through the three vertices, so the conormal is of second order
-    in the spacing even where that is uneven.
+    The boundary tangent is the tangent of the parabola through the vertex and its two neighbours along the boundary, so
+    the conormal is second order in the spacing even where the spacing is uneven.
+
+    Args:
+        normals: unit normals.
+        to_next: offsets to the next vertex along the boundary.
+        to_previous: offsets to the previous vertex along the boundary.
     """
     xp = normals.__array_namespace__()
-    # The parabola's tangent, times the product of the two squared lengths: no division, so empty rows stay finite.
+    # The tangent is scaled by both squared lengths, which avoids a division and keeps empty rows finite.
     next_squared = xp.sum(to_next**2, axis=-1, keepdims=True)
     previous_squared = xp.sum(to_previous**2, axis=-1, keepdims=True)
     tangent = to_next * previous_squared - to_previous * next_squared
@@ -56,7 +62,10 @@ def boundary_frames(
 def corner_conormals(
     normals: Float[AnyArray, "N 3"], to_next: Float[AnyArray, "N 3"], to_previous: Float[AnyArray, "N 3"]
 ) -> Float[AnyArray, "N 2 3"]:
-    """The outward conormals of both sides of a corner of the boundary: towards the next vertex, then the previous."""
+    """The outward conormals of the two sides of a boundary corner.
+
+    The first conormal belongs to the side towards the next vertex, the second to the side towards the previous one.
+    """
     xp = normals.__array_namespace__()
     return xp.stack([unit(xp.cross(to_next, normals)), unit(xp.cross(-to_previous, normals))], axis=1)
 
@@ -64,10 +73,10 @@ def corner_conormals(
 def transport(
     source: Float[AnyArray, "*#N 3"], target: Float[AnyArray, "*#N 3"], vectors: Float[AnyArray, "*#N 3"]
 ) -> Float[AnyArray, "*#N 3"]:
-    """Transport of tangent vectors from the plane of normal ``source`` to the plane of normal ``target``.
+    """Tangent vectors transported from the plane with normal ``source`` to the plane with normal ``target``.
 
-    By the shortest rotation that takes one normal to the other: for X tangent at the source it is
-    X - (t.X) / (1 + s.t) (s + t). The transport of the paper goes along an edge instead: see `layout.Places`.
+    The transport is the shortest rotation that takes the source normal s to the target normal t. For X tangent at the
+    source it is X - (t.X) / (1 + s.t) (s + t). The paper transports along an edge instead: see `layout.Places`.
     """
     xp = vectors.__array_namespace__()
     cosine = xp.sum(source * target, axis=-1, keepdims=True)

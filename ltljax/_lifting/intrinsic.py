@@ -1,11 +1,12 @@
-"""The intrinsic lift: neighbours are laid into the plane by edge lengths alone, so that bending changes nothing.
+"""The intrinsic lift: neighbours are laid into the plane by edge lengths alone, so bending the surface changes nothing.
 
-What enters: positions, and the frozen intrinsic Delaunay triangulation. What leaves: the length of every edge and the
-direction of every half-edge at its tail, and from them the place of each neighbour in the chart of a vertex and the
-angle by which parallel transport turns its vectors. Pure functions of the positions, in NumPy and JAX alike.
+Inputs: positions, and the frozen intrinsic Delaunay triangulation. Outputs: the length of every edge and the direction
+of every half-edge at its tail. They determine the position of each neighbour in the chart of a vertex, and the angle by
+which parallel transport rotates its vectors. All are pure functions of the positions, for NumPy and JAX arrays alike.
 
-The chart of a vertex spreads its triangles flat, one after another. Their angles sum to T; inside, directions are
-multiplied by 2 pi / T, so that the ring closes. Half-edge h of edge e is 2 e or 2 e + 1, and h ^ 1 is its twin.
+The chart of a vertex lays its triangles flat, one after another. Let T be the sum of their angles. At interior vertices
+directions are multiplied by 2 pi / T, so that the ring closes. The half-edges of edge e are 2 e and 2 e + 1, so that
+the twin of half-edge h is h ^ 1.
 
 Sources: the chart is the discrete exponential map of Knoppel, Crane, Pinkall and Schroder (2013), Globally optimal
 direction fields, doi:10.1145/2461912.2462005, section 6; flips and the directions of new edges follow Sharp, Soliman
@@ -22,21 +23,21 @@ from .frames import transport, unit
 from .jets import INTERIOR, RIGHT_CORNER
 from .ring import RingTopology, offsets, take_slots
 
-# If a face violates the triangle inequality up to a slack of this fraction of its shortest edge, all edges are
-# lengthened by the same amount until it holds (Sharp and Crane 2020, A Laplacian for nonmanifold triangle meshes,
+# The triangle inequality must hold with a slack of this fraction of a face's shortest edge. Otherwise all edges are
+# lengthened by the same amount (Sharp and Crane 2020, A Laplacian for nonmanifold triangle meshes,
 # doi:10.1111/cgf.14069, section 4.5).
 _SLACK = 1e-6
 
 
 class Flips(eqx.Module):
-    """Edge flips in levels. Those of one level do not share a face, so that all of them can be made at once.
+    """Edge flips in levels. The flips of one level do not share a face, so all of them can be made at once.
 
-    Levels are as wide as the widest; what is left of the others is filled with half-edge H, behind the last.
+    All levels have the width N of the widest one. Unused entries hold half-edge H, one past the last.
 
     Attributes:
-        flipped: (L, N) a half-edge a -> b of each edge. Afterwards it is d -> c and its twin c -> d, with c the apex on
-            its left and d the one on its right.
-        around: (L, 4, N) the half-edges b -> c, c -> a, a -> d and d -> b.
+        flipped: (L, N) half-edge a -> b of each flipped edge. With c the apex on its left and d the apex on its right,
+            the flip turns it into d -> c and its twin into c -> d.
+        around: (L, 4, N) half-edges b -> c, c -> a, a -> d and d -> b.
     """
 
     flipped: Int[AnyArray, "L N"]
@@ -44,13 +45,13 @@ class Flips(eqx.Module):
 
 
 class Triangulation(eqx.Module):
-    """The intrinsic Delaunay triangulation of a mesh, as the flips that lead to it: frozen when vertices move.
+    """The intrinsic Delaunay triangulation of a mesh, stored as edge flips. It stays frozen when vertices move.
 
     Attributes:
-        ends: (E, 2) the vertices of each edge of the mesh; half-edge 2 e leads from the first to the second.
-        slots: (H,) where each half-edge of the mesh stands in the table of one-rings, its blocks laid end to end.
+        ends: (E, 2) vertices of each edge of the mesh; half-edge 2 e leads from the first to the second.
+        slots: (H,) position of each half-edge of the mesh in the table of one-rings, its blocks concatenated.
         flips: the flips.
-        tails: (H,) the vertex at which each half-edge begins after all flips.
+        tails: (H,) vertex at which each half-edge begins after all flips.
     """
 
     ends: Int[AnyArray, "E 2"]
@@ -60,13 +61,16 @@ class Triangulation(eqx.Module):
 
 
 class Directions(eqx.Module):
-    """Lengths and directions in the charts of all vertices.
+    """Edge lengths, and the directions of half-edges in the charts of their tails.
+
+    One edge of length zero is appended to the edges of the triangulation. It pads paths that end early, and transport
+    along it is the identity.
 
     Attributes:
-        lengths: (E + 1,) the length of every edge of the triangulation; the last one is zero, for paths that end early.
-        angles: (H + 2,) the direction of every half-edge in the chart of its tail, in radians; the last two belong to
-            the edge of length zero, along which nothing turns.
-        angle_sums: (V,) the sum of the angles of the faces at each vertex.
+        lengths: (E + 1,) length of every edge; the last is zero.
+        angles: (H + 2,) direction of every half-edge in the chart of its tail, in radians; the last two belong to the
+            edge of length zero.
+        angle_sums: (V,) sum of the face angles at each vertex, in radians.
     """
 
     lengths: Float[AnyArray, " L"]
@@ -83,10 +87,10 @@ class Paths(eqx.Module):
     """The half-edges along which the neighbours of a block's rows are reached.
 
     Attributes:
-        first: (K, N) the first half-edge of every slot.
-        columns: (n,) the columns of the block with neighbours beyond the one-ring.
-        further: (R, K, n) the half-edges that follow in those columns, padded with the half-edge of length zero.
-        in_space: (m,) the columns of the block whose neighbours are laid out in space instead.
+        first: (K, N) first half-edge of every slot.
+        columns: (n,) columns of the block that have neighbours beyond the one-ring.
+        further: (R, K, n) subsequent half-edges in those columns, padded with the half-edge of length zero.
+        in_space: (m,) columns of the block whose neighbours are laid out in space instead.
     """
 
     first: Int[AnyArray, "K N"]
@@ -99,11 +103,11 @@ class RingAngles(eqx.Module):
     """Lengths and angles of the mesh itself, before any flip.
 
     Attributes:
-        lengths: (E,) the lengths of the edges.
-        corners: for each block of the one-rings the angle (K, N) of each slot from the first one.
-        sums: (V,) the sum of the angles of the faces at each vertex.
-        first: (V,) the direction of the first slot at vertices of a smooth boundary. The second axis of their chart is
-            the outward conormal, from the parabola through three boundary vertices.
+        lengths: (E,) lengths of the edges.
+        corners: for each block of the one-rings, the angle (K, N) between the first slot and each slot.
+        sums: (V,) sum of the face angles at each vertex.
+        first: (V,) direction of the first slot at vertices of a smooth boundary. The second axis of their chart is the
+            outward conormal of the parabola through three boundary vertices.
     """
 
     lengths: Float[AnyArray, " E"]
@@ -124,14 +128,14 @@ def ring_angles(
 
     def around(block, topology):
         has_face, ahead, behind, across = _sides(vertices, block, topology)
-        # Where no face follows the sides are those of some triangle, whose angle has a derivative.
+        # Where no face follows, use the sides of an equilateral triangle, whose angle has finite derivatives.
         sides = (xp.where(has_face, side + added, 1) for side in (across, ahead, behind))
         angles = xp.where(has_face, corner_angle(*sides), 0)
         total = xp.sum(angles, axis=0)
-        next_one = ahead[0] + added
+        following = ahead[0] + added
         previous = take_slots(ahead, (topology.valences - 1).clip(0)[None])[0] + added
-        # The tangent, as complex numbers: next / |next|^2 - previous / |previous|^2, over what does not turn it.
-        tangent = previous - next_one * xp.cos(total), -next_one * xp.sin(total)
+        # The tangent is, up to a positive factor, next / |next|^2 - previous / |previous|^2 as complex numbers.
+        tangent = previous - following * xp.cos(total), -following * xp.sin(total)
         first = np.pi - xp.arctan2(tangent[1], xp.where(topology.is_boundary, tangent[0], 1))
         return xp.cumsum(angles, axis=0) - angles, total, first
 
@@ -140,9 +144,9 @@ def ring_angles(
 
 
 def directions(angles: RingAngles, triangulation: Triangulation, kinds: Int[AnyArray, " V"]) -> Directions:
-    """The lengths and directions of the triangulation's half-edges in the charts of their tails.
+    """The lengths of the triangulation's edges, and the directions of its half-edges in the charts of their tails.
 
-    On a smooth boundary the chart is turned so that the outward conormal is the second axis; at a corner the second
+    On a smooth boundary the chart is rotated so that its second axis is the outward conormal. At a corner the second
     axis is the conormal of the first side.
     """
     xp = angles.lengths.__array_namespace__()
@@ -157,22 +161,22 @@ def directions(angles: RingAngles, triangulation: Triangulation, kinds: Int[AnyA
 
 
 def flipped(angles: RingAngles, triangulation: Triangulation) -> tuple[Float[AnyArray, " E"], Float[AnyArray, " H"]]:
-    """After all flips: the length of each edge, and the angle of each half-edge from the first slot of its tail."""
+    """The length of each edge after all flips, and the angle of each half-edge from the first slot of its tail."""
     xp = angles.lengths.__array_namespace__()
     flips = triangulation.flips
     lengths = angles.lengths
     around = take(xp.concatenate([block.reshape(-1) for block in angles.corners]), triangulation.slots)
     if not flips.flipped.shape[0]:
         return lengths, around
-    # One more edge, of length one, for the places of narrow levels that are not used.
-    one = xp.ones(1, dtype=lengths.dtype)
-    start = xp.concatenate([lengths, one]), xp.concatenate([around, 0 * one, 0 * one])
+    # Unused entries of narrow levels flip one additional edge, of length one.
+    unit_length = xp.ones(1, dtype=lengths.dtype)
+    start = xp.concatenate([lengths, unit_length]), xp.concatenate([around, 0 * unit_length, 0 * unit_length])
     if isinstance(around, np.ndarray):
         for level in zip(flips.flipped, flips.around, strict=True):
             start = flip(*start, *level)
         lengths, around = start
     else:
-        # A loop, as XLA takes seconds to compile a few levels that follow one another.
+        # Unrolled, even a few levels would take XLA seconds to compile.
         levels = flips.flipped, flips.around
         (lengths, around), _ = jax.lax.scan(lambda carry, level: (flip(*carry, *level), None), start, levels)
     return lengths[:-1], around[:-2]
@@ -184,45 +188,49 @@ def flip(
     flipped: Int[AnyArray, " N"],
     around: Int[AnyArray, "4 N"],
 ) -> tuple[Float[AnyArray, " E"], Float[AnyArray, " H"]]:
-    """Lengths and angles after the flips of one level: each pair of faces is laid flat and the other diagonal taken."""
+    """Lengths and angles after the flips of one level.
+
+    Each flip lays the two faces of its edge flat and replaces the edge by the other diagonal.
+    """
     xp = lengths.__array_namespace__()
     ab, (bc, ca, ad, db) = take(lengths, flipped >> 1), take(lengths, around >> 1)
-    # The quadrilateral with a at the origin, b on the first axis, c above and d below it.
+    # Place a at the origin, b on the positive first axis, c above it and d below it.
     cx, cy = (ab**2 + ca**2 - bc**2) / (2 * ab), double_area(ab, bc, ca) / ab
     dx, dy = (ab**2 + ad**2 - db**2) / (2 * ab), double_area(ab, ad, db) / ab
     along, down = dx - cx, cy + dy
     at_c = xp.arctan2(cx * down + cy * along, cy * down - cx * along)
     at_d = xp.arctan2((ab - dx) * down + dy * along, dy * down - (ab - dx) * along)
-    new = take(angles, around[3]) + at_d, take(angles, around[1]) + at_c
+    angle_d, angle_c = take(angles, around[3]) + at_d, take(angles, around[1]) + at_c
     lengths = _replace(lengths, flipped >> 1, xp.sqrt(along**2 + down**2))
-    return lengths, _replace(_replace(angles, flipped, new[0]), flipped ^ 1, new[1])
+    return lengths, _replace(_replace(angles, flipped, angle_d), flipped ^ 1, angle_c)
 
 
 def double_area(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
-    """Twice the area of triangles with sides a, b and c (Heron); zero, with zero derivative, where there is none."""
+    """Twice the area of triangles with sides a, b, c (Heron). Impossible sides give zero, with zero derivative."""
     xp = a.__array_namespace__()
     total = a + b + c
     size = xp.where(total > 0, total, 1)
-    # Over the perimeter, so that no power of a length leaves the range of the float type.
+    # Divide by the perimeter first: powers of a length could overflow or underflow.
     product = ((b + c - a) / size) * ((a + c - b) / size) * ((a + b - c) / size)
     has_area = product > 0
     return xp.where(has_area, size * size * xp.sqrt(xp.where(has_area, product, 1)), 0) / 2
 
 
 def corner_angle(a: AnyArray, b: AnyArray, c: AnyArray) -> AnyArray:
-    """The angle opposite a in triangles with sides a, b and c."""
+    """The angle opposite side a in triangles with sides a, b and c, in radians."""
     return a.__array_namespace__().arctan2(2 * double_area(a, b, c), b**2 + c**2 - a**2)
 
 
 def lay_out(directions: Directions, paths: Paths) -> tuple[Float[AnyArray, "K N 2"], Float[AnyArray, "K N"]]:
-    """The neighbours of a block's rows in the charts of their vertices, and the angles that turn their vectors.
+    """The neighbours of a block's rows in the charts of their vertices, and the angles that transport their vectors.
 
-    The direction of each half-edge of a path is given in the chart of its tail. The angle accumulated so far rotates it
-    into the chart of the row's vertex. Exact where the path and the straight line to its end enclose no curvature.
+    The direction of each half-edge of a path is given in the chart of its tail; the angle accumulated along the path
+    rotates it into the chart of the row's vertex. The result is exact if the path and the straight line to its end
+    enclose no curvature.
     """
     xp = directions.angles.__array_namespace__()
-    none = xp.zeros(paths.first.shape, dtype=directions.angles.dtype)
-    lifted, turn = _step(directions, xp.zeros((*none.shape, 2), dtype=none.dtype), none, paths.first)
+    zeros = xp.zeros(paths.first.shape, dtype=directions.angles.dtype)
+    lifted, turn = _step(directions, xp.zeros((*zeros.shape, 2), dtype=zeros.dtype), zeros, paths.first)
     if not paths.columns.shape[0]:
         return lifted, turn
     far, far_turn = lifted[:, paths.columns], turn[:, paths.columns]
@@ -232,7 +240,7 @@ def lay_out(directions: Directions, paths: Paths) -> tuple[Float[AnyArray, "K N 
 
 
 def _step(directions, lifted, turn, half_edges):
-    """One half-edge further: places and turns at its head."""
+    """Positions and accumulated angles after one more half-edge."""
     xp = turn.__array_namespace__()
     leaving, length = take(directions.angles, half_edges), take(directions.lengths, half_edges >> 1)
     direction = leaving + turn
@@ -241,9 +249,10 @@ def _step(directions, lifted, turn, half_edges):
 
 
 def edge_turn(directions: Directions, half_edges: Int[AnyArray, "*N"]) -> Float[AnyArray, "*N"]:
-    """The angle by which parallel transport from the head of a half-edge to its tail turns components in the charts.
+    """The angle by which transport from the head of a half-edge to its tail rotates components in the charts.
 
-    Transport along an edge preserves its direction: outgoing at the tail, opposite to the twin's at the head.
+    Parallel transport preserves the direction of the edge, which points along the half-edge at its tail and against the
+    twin at its head.
     """
     return take(directions.angles, half_edges) + np.pi - take(directions.angles, half_edges ^ 1)
 
@@ -252,9 +261,9 @@ class CotangentRows(eqx.Module):
     """The rows of a block that hold the cotangent Laplacian of the triangulation.
 
     Attributes:
-        columns: (n,) their columns in the block.
-        edges: (5, K, n) for each slot its edge, then the other two edges of the face on its left and of that on its
-            right; the edge of length zero where there is none.
+        columns: (n,) columns of these rows in the block.
+        edges: (5, K, n) edge of each slot, then the other two edges of the face on its left, then the other two edges
+            of the face on its right; the edge of length zero where there is no face.
     """
 
     columns: Int[AnyArray, " n"]
@@ -264,12 +273,14 @@ class CotangentRows(eqx.Module):
 def cotangent_weights(
     directions: Directions, rows: CotangentRows
 ) -> tuple[Float[AnyArray, "K n"], Float[AnyArray, " n"]]:
-    """Rows of the cotangent Laplacian over the areas A of the circumcentric dual cells, and these areas.
+    """Rows of the cotangent Laplacian divided by the areas A of the circumcentric dual cells, and these areas.
 
-    With w = (cot alpha + cot beta) / 2 the weights are w / A with A the sum of w l^2 / 4. In a Delaunay triangulation
-    they are non-negative inside, where ``sum c p = 0`` and ``sum c |p|^2 = 4`` hold before chart angles are rescaled.
-    The row converges only in the weak sense. Negative weights, which boundary edges opposite an obtuse angle have and
-    others may have after the vertices have moved, are clipped to zero.
+    The weights are c = w / A, with w = (cot alpha + cot beta) / 2 and A the sum of w l^2 / 4. In a Delaunay
+    triangulation they are non-negative in the interior, where ``sum c p = 0`` and ``sum c |p|^2 = 4`` hold before the
+    angles of the chart are rescaled. The row converges only in the weak sense.
+
+    Negative weights are clipped to zero. They occur at boundary edges opposite an obtuse angle, and can occur elsewhere
+    after vertices have moved.
 
     Source: Bobenko and Springborn (2007), A discrete Laplace-Beltrami operator for simplicial surfaces,
     doi:10.1007/s00454-007-9006-1.
@@ -291,7 +302,7 @@ def cotangent_weights(
 def boundary_conormals(
     directions: Directions, kinds: Int[AnyArray, " V"], boundary: Int[AnyArray, " B"]
 ) -> Float[AnyArray, "B 2 2"]:
-    """The outward conormals of both sides of each boundary vertex in its chart."""
+    """The outward conormals of both sides of each boundary vertex, in its chart."""
     xp = directions.angles.__array_namespace__()
     is_corner = take(kinds, boundary) >= RIGHT_CORNER
     second = xp.where(is_corner, take(directions.angle_sums, boundary) - np.pi / 2, np.pi / 2)
@@ -307,9 +318,9 @@ def aligned_frames(
     corners: Float[AnyArray, "K N"],
     sums: Float[AnyArray, " N"],
 ) -> Float[AnyArray, "N 2 3"]:
-    """Frames rotated in their planes to bring the ring in space as close as possible to the ring in the chart.
+    """Frames rotated in their planes so that the ring in space agrees with the ring in the chart as well as possible.
 
-    Every face is turned into the tangent plane by the shortest rotation, which is exact beside a crease.
+    Every face is rotated into the tangent plane by the shortest rotation, which is exact beside a crease.
     """
     xp = frames.__array_namespace__()
     following = topology.following(offsets.shape[0])
@@ -318,9 +329,9 @@ def aligned_frames(
     face_normals = unit(xp.cross(offsets, after))
     real, imaginary = 0, 0
     for edges, theta in ((offsets, scaled), (after, take_slots(scaled, following))):
-        turned = transport(face_normals, normals[None], edges)
-        x, y = xp.moveaxis(xp.einsum("knc,nac->kna", turned, frames), -1, 0)
-        # The quotient of both directions as complex numbers, weighted by length.
+        rotated = transport(face_normals, normals[None], edges)
+        x, y = xp.moveaxis(xp.einsum("knc,nac->kna", rotated, frames), -1, 0)
+        # As complex numbers, sum the quotients of the two directions, weighted by length.
         real += xp.sum(x * xp.cos(theta) + y * xp.sin(theta), axis=0)
         imaginary += xp.sum(y * xp.cos(theta) - x * xp.sin(theta), axis=0)
     squared = real**2 + imaginary**2
@@ -332,24 +343,27 @@ def aligned_frames(
 
 
 def _sides(vertices, block: Block, topology: RingTopology):
-    """For every slot of the one-rings: whether a face follows, the lengths of the edges to the slot's neighbour and to
-    the next one, and of the edge between these."""
+    """Whether a face follows each slot of the one-rings, and the lengths of its sides.
+
+    The sides are the edges from the vertex to the slot's neighbour and to the next neighbour, and the edge between the
+    two neighbours.
+    """
     xp = vertices.__array_namespace__()
-    seen = offsets(vertices, block)
-    following = topology.following(seen.shape[0])
-    has_face = following != xp.arange(seen.shape[0], dtype=following.dtype)[:, None]
-    after = take_slots(seen, following)
+    edges = offsets(vertices, block)
+    following = topology.following(edges.shape[0])
+    has_face = following != xp.arange(edges.shape[0], dtype=following.dtype)[:, None]
+    after = take_slots(edges, following)
 
     def norm(vectors, is_used):
         squared = xp.sum(vectors**2, axis=-1)
         is_used = is_used & (squared > 0)
         return xp.where(is_used, xp.sqrt(xp.where(is_used, squared, 1)), 0)
 
-    return has_face, norm(seen, block.is_used), norm(after, has_face), norm(after - seen, has_face)
+    return has_face, norm(edges, block.is_used), norm(after, has_face), norm(after - edges, has_face)
 
 
 def _missing(has_face, ahead, behind, across):
-    """By how much each corner falls short of the slack of the triangle inequality; minus infinity without a face."""
+    """The length each corner lacks to satisfy the triangle inequality with slack; minus infinity without a face."""
     xp = ahead.__array_namespace__()
     shortest = xp.minimum(xp.minimum(ahead, behind), across)
     return xp.where(has_face, _SLACK * shortest - (ahead + behind - across), -np.inf)
@@ -358,12 +372,12 @@ def _missing(has_face, ahead, behind, across):
 def with_columns(
     values: Float[AnyArray, "K N *C"], columns: Int[AnyArray, " n"], new: Float[AnyArray, "K n *C"]
 ) -> Float[AnyArray, "K N *C"]:
-    """The values of a block with some columns replaced."""
+    """The values of a block, with some columns replaced."""
     return _replace(values, columns, new, axis=1) if columns.shape[0] else values
 
 
 def _replace(values: AnyArray, index: AnyArray, new: AnyArray, axis: int = 0) -> AnyArray:
-    """The values with those at some indices along an axis replaced."""
+    """The values, with the entries at some indices along an axis replaced."""
     where = (slice(None),) * axis + (index,)
     if isinstance(values, np.ndarray):
         values = values.copy()

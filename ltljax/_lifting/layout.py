@@ -1,10 +1,11 @@
-"""Where the neighbours of every row lie in the plane of their vertex, and how their vectors turn on the way there.
+"""The lifted neighbours of every row, and the rotations that transport vectors from them to the vertex.
 
-What enters: positions, frames and directions. What leaves: for each block of a table the lifted neighbours (K, N, 2)
-and the turns (K, N, 2), cosine and sine, that take components in the frame of a neighbour to the frame of the vertex.
+Inputs: positions, frames and directions. Outputs, for each block of a table: the lifted neighbours (K, N, 2), and the
+cosine and sine (K, N, 2) of the rotation from components in a neighbour's frame to components in the vertex's frame.
 
-Rows are laid out in one of two ways: by edge lengths alone in the chart of the vertex (`intrinsic`), or in space in its
-tangent plane (`ring`). The first is the default; the second serves the other lifts, and faces that are folded over.
+A row is laid out in one of two ways: in the chart of its vertex, by edge lengths alone (`intrinsic`), or in space, by
+projection to the tangent plane (`ring`). The first is the default. The second is used by the other lifts and near faces
+that are folded over.
 """
 
 from typing import Literal
@@ -22,18 +23,19 @@ PerBlock = tuple[AnyArray, ...]
 
 
 class Places(eqx.Module):
-    """What lays out neighbours: the arrays of a surface that a layout depends on.
+    """The arrays of a surface on which the layout of its neighbours depends.
 
     Attributes:
         vertices: (V, 3) positions.
         normals: (V, 3) unit normals.
-        frames: (V, 2, 3) tangent frames, turned like the charts.
-        directions: lengths and directions in the charts; None where all rows are laid out in space.
-        is_creased: (V,) the vertices at creases, whose vectors are transported in charts; None where there is none.
-        lift: how rows in space are laid into tangent planes.
-        transport: how rows in space turn vectors. "shortest" rotates one normal to the other; "paper" takes the edge
-            projected to one tangent plane to the same edge projected to the other (Chen, Chi and Wu, arXiv 0907.1817,
-            section 2).
+        frames: (V, 2, 3) tangent frames, aligned with the charts.
+        directions: edge lengths and chart directions; None if all rows are laid out in space.
+        is_creased: (V,) mask of the vertices at creases, where vectors are transported in charts; None if there are no
+            creases.
+        lift: the map from space to the tangent plane, for rows laid out in space.
+        transport: the transport of vectors, for rows laid out in space. "shortest" rotates the neighbour's normal to
+            the vertex's normal by the shortest rotation. "paper" maps the edge projected to one tangent plane to the
+            edge projected to the other (Chen, Chi and Wu, arXiv 0907.1817, section 2).
     """
 
     vertices: Float[AnyArray, "V 3"]
@@ -49,10 +51,10 @@ class Places(eqx.Module):
 
         Args:
             table: the neighbours.
-            paths: for each block the half-edges that lead to them; None where all rows are laid out in space.
+            paths: for each block, the half-edges that lead to its neighbours; None if all rows are laid out in space.
         """
         if paths is None or self.directions is None:
-            # A table joins results along their last axis, which is that of the rows.
+            # A table joins results along their last axis, so the rows must be there.
             return rows_second(tuple(table.each(lambda block: _moved(self._lifted_in_space(block), 1, -1))))
         blocks = []
         for block, path in zip(table.blocks, paths, strict=True):
@@ -63,10 +65,11 @@ class Places(eqx.Module):
         return tuple(blocks)
 
     def turns(self, table: Table, paths: tuple[Paths, ...] | None) -> PerBlock:
-        """The cosine and sine (K, N, 2) of the angle by which transport turns components, for each block.
+        """The cosine and sine (K, N, 2) of the angle by which transport rotates components, for each block.
 
-        In space, between refined normals, transport converges so fast that second derivatives of vectors do; in charts
-        the curvature of a polyhedron lies in single vertices, and they do not. Across creases only charts are right.
+        Transport in space between refined normals converges fast enough for second derivatives of vector fields to
+        converge. Transport in charts does not, because all curvature of a polyhedron is concentrated at its vertices.
+        Across creases only transport in charts is correct, so it is used there.
         """
         in_space = rows_second(tuple(table.each(lambda block: _moved(self._turns_in_space(block), 1, -1))))
         if paths is None or self.directions is None or self.is_creased is None:
@@ -85,16 +88,18 @@ class Places(eqx.Module):
         return lifted_ring(offsets(self.vertices, block), block.centre(self.frames), self.lift)
 
     def _turns_in_space(self, block: Block) -> AnyArray:
-        frame, near = block.centre(self.frames)[None], block.neighbours(self.frames)
+        frame, neighbour_frame = block.centre(self.frames)[None], block.neighbours(self.frames)
         xp = self.vertices.__array_namespace__()
         if self.transport == "shortest":
-            first = transport(block.neighbours(self.normals), block.centre(self.normals)[None], near[..., 0, :])
-            return xp.einsum("knac,knc->kna", xp.broadcast_to(frame, near.shape), first)
+            e1 = neighbour_frame[..., 0, :]
+            transported = transport(block.neighbours(self.normals), block.centre(self.normals)[None], e1)
+            return xp.einsum("knac,knc->kna", xp.broadcast_to(frame, neighbour_frame.shape), transported)
         edge = offsets(self.vertices, block)
         leaving, arriving = (
-            xp.einsum("knac,knc->kna", xp.broadcast_to(basis, near.shape), edge) for basis in (frame, near)
+            xp.einsum("knac,knc->kna", xp.broadcast_to(basis, neighbour_frame.shape), edge)
+            for basis in (frame, neighbour_frame)
         )
-        # The quotient of both directions as unit complex numbers; if the edge projects to zero, the identity.
+        # As complex numbers: the quotient of the two directions, or the identity if the edge projects to zero.
         real = xp.sum(leaving * arriving, axis=-1)
         imaginary = leaving[..., 1] * arriving[..., 0] - leaving[..., 0] * arriving[..., 1]
         squared = real**2 + imaginary**2
@@ -104,7 +109,7 @@ class Places(eqx.Module):
 
 
 def rows_last(lifted: PerBlock) -> PerBlock:
-    """Lifted rings (K, N, 2) of all blocks as (K, 2, N), as a table hands them on in batches."""
+    """Lifted rings (K, N, 2) of all blocks as (K, 2, N): the layout in which a table passes them on in batches."""
     return tuple(_moved(values, 1, -1) for values in lifted)
 
 
@@ -120,21 +125,21 @@ def _moved(values: AnyArray, source: int, destination: int) -> AnyArray:
 def block_paths(
     table: Table, row_offsets: np.ndarray, paths: np.ndarray, no_half_edge: int, is_extrinsic: np.ndarray | None
 ) -> tuple[Paths, ...]:
-    """The paths (n, R) of the entries of rows, in the blocks of their table (host).
+    """The paths to the entries of all rows, arranged like the blocks of their table (host).
 
     Args:
         table: the table of the rows.
-        row_offsets: (V + 1,) where the entries of each row begin.
-        paths: (n, R) the half-edges that lead to each entry.
+        row_offsets: (V + 1,) index of the first entry of each row.
+        paths: (n, R) half-edges that lead to each entry.
         no_half_edge: the half-edge of length zero.
-        is_extrinsic: (V,) the rows that are laid out in space, if any.
+        is_extrinsic: (V,) mask of the rows laid out in space; None if there are none.
     """
     steps = [slot_values(row_offsets, hop, no_half_edge) for hop in paths.T]
     blocks = []
     for block, first, *further in zip(table.blocks, *steps, strict=True):
-        goes_on = [np.any(hop != no_half_edge, axis=0) for hop in further]
-        columns = np.flatnonzero(np.any(goes_on, axis=0)) if further else np.zeros(0, int)
-        used = [hop[:, columns] for hop, has in zip(further, goes_on, strict=True) if has.any()]
+        is_long = [np.any(hop != no_half_edge, axis=0) for hop in further]
+        columns = np.flatnonzero(np.any(is_long, axis=0)) if further else np.zeros(0, int)
+        used = [hop[:, columns] for hop, mask in zip(further, is_long, strict=True) if mask.any()]
         stacked = np.stack(used) if used else np.zeros((0, len(first), 0))
         in_space = np.zeros(0) if is_extrinsic is None else np.flatnonzero(block.centre(is_extrinsic))
         blocks.append(Paths(*(a.astype(np.int32) for a in (first, columns, stacked, in_space))))

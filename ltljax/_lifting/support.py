@@ -1,7 +1,7 @@
-"""Which neighbours a row uses: chosen once, on the host, from the positions; frozen afterwards.
+"""The choice of the neighbours that each row uses: made once on the host from the positions, and frozen afterwards.
 
-What enters: for any vertices, their neighbours within a few edges and where these lie in the plane. What leaves: rows
-of neighbours, for the fit of a polynomial and for non-negative operators, and a record of how the latter were found.
+Inputs: for any vertices, their neighbours within a few edges and the positions of these in the plane. Outputs: rows of
+neighbours for polynomial fits and for non-negative operators, and a record of how the latter were chosen.
 """
 
 import dataclasses
@@ -14,35 +14,35 @@ from .charts import Charts, Neighbourhood
 from .jets import conditions, moment_matrix, num_monomials, relative_residual, ring_moments, scaled_targets
 from .ring import Lift, lifted_ring
 
-# A ring determines a polynomial well when the least eigenvalue of its moment matrix, scaled to unit diagonal, is this
-# large.
-# A regular hexagon has 0.29 for a quadratic; neighbours on a conic have none.
+# A ring determines a polynomial of a degree well if the smallest eigenvalue of its moment matrix, scaled to unit
+# diagonal, exceeds this. For quadratics it is 0.29 on a regular hexagon, and 0 for neighbours on a conic through the
+# vertex.
 _WELL_PLACED = {2: 0.02, 3: 0.003, 4: 0.001}
-# Below this it determines none.
+# Below this eigenvalue a ring does not determine a polynomial at all.
 _PLACED = 1e-8
 # Relative moment residual below which a row counts as consistent.
 CONSISTENT = 1e-8
-# Rings beyond the third reach so far that a row would no longer be local.
+# Rows with neighbours beyond the third ring would no longer be local.
 LARGEST_RING = 3
-# The widest rings of a fit, by its degree.
+# The largest number of rings of a fit, by degree.
 LARGEST_FIT = {2: 3, 3: 5, 4: 5}
-# Vertices at once.
+# Vertices per batch.
 _BATCH = 1 << 13
 
-# The neighbourhood of vertices (N,) within k edges.
+# Returns the neighbourhoods of vertices (N,) within k edges.
 Reach = Callable[[np.ndarray, int], Neighbourhood]
-# Hands on the batches it is given, and may show how far they are.
+# Passes on the batches it is given, and may show progress.
 Watch = Callable[[list[np.ndarray]], Iterable[np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """The neighbours of every vertex that an operator uses.
+    """The neighbours that an operator uses at every vertex.
 
     Attributes:
-        offsets: (V + 1,) where the entries of each vertex begin.
+        offsets: (V + 1,) index of the first entry of each vertex.
         members: (n,) the neighbours.
-        paths: (n, R) the half-edges that lead to them, as of `Neighbourhood`.
+        paths: (n, R) half-edges that lead to the neighbours, see `Neighbourhood`.
     """
 
     offsets: np.ndarray
@@ -51,19 +51,19 @@ class Rows:
 
     @classmethod
     def all_of(cls, around: Neighbourhood) -> "Rows":
-        """The rows that hold whole neighbourhoods, one for every vertex."""
+        """Rows that hold the whole neighbourhood of every vertex."""
         return cls(around.offsets, around.members, around.paths)
 
     def replaced(self, owners: np.ndarray, members: np.ndarray, paths: np.ndarray, which: np.ndarray) -> "Rows":
-        """The rows with those of the vertices ``which`` replaced by entries (n,) that name their owners."""
-        is_kept = np.ones(len(self.offsets) - 1, bool)
-        is_kept[which] = False
-        own = np.repeat(np.arange(len(is_kept)), np.diff(self.offsets))
-        stays = is_kept[own]
+        """Copies of the rows in which the rows of the vertices ``which`` are replaced by entries (n,) with owners."""
+        is_unchanged = np.ones(len(self.offsets) - 1, bool)
+        is_unchanged[which] = False
+        own = np.repeat(np.arange(len(is_unchanged)), np.diff(self.offsets))
+        stays = is_unchanged[own]
         owners = np.concatenate([own[stays], owners])
         order = np.argsort(owners, kind="stable")
         return Rows(
-            np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=len(is_kept)))]),
+            np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=len(is_unchanged)))]),
             np.concatenate([self.members[stays], members])[order].astype(self.members.dtype),
             np.concatenate([self.paths[stays], paths])[order].astype(np.int32),
         )
@@ -71,11 +71,11 @@ class Rows:
 
 @dataclasses.dataclass(frozen=True)
 class SupportRecord:
-    """How the rows of a non-negative operator were found.
+    """How the rows of a non-negative operator were chosen.
 
     Attributes:
-        rings: (V,) the number of rings the row was chosen from, 1 to 3.
-        residual: (V,) the relative moment residual of the row; a consistent one has zero to rounding.
+        rings: (V,) number of rings from which the row was chosen, 1 to 3.
+        residual: (V,) relative moment residual of the row; zero up to rounding for a consistent row.
     """
 
     rings: np.ndarray
@@ -95,14 +95,14 @@ def reach_in_space(
     longest_path: int = 0,
     no_half_edge: int = 0,
 ) -> Reach:
-    """Neighbourhoods along the edges of the mesh, laid into the tangent planes.
+    """A function that finds neighbourhoods along the edges of the mesh and lifts them to the tangent planes.
 
     Args:
         vertices: (V, 3) positions.
-        frames: (V, 2, 3) the bases of the tangent planes.
-        lift: how neighbours are laid into them.
-        k_ring: the vertices within k edges of each of the given ones, as offsets and members.
-        longest_path: the number of half-edges that paths have room for.
+        frames: (V, 2, 3) bases of the tangent planes.
+        lift: map from space to the tangent planes.
+        k_ring: function that returns the vertices within k edges of each given vertex, as offsets and members.
+        longest_path: largest number of half-edges in a path.
         no_half_edge: the half-edge of length zero.
     """
 
@@ -116,7 +116,7 @@ def reach_in_space(
 
 
 def reach_in_charts(charts: Charts, in_space: Reach, is_extrinsic: np.ndarray | None) -> Reach:
-    """Neighbourhoods in the charts of the vertices, but in space for those that are marked."""
+    """A function that finds neighbourhoods in the charts of the vertices, or in space where ``is_extrinsic``."""
     if is_extrinsic is None:
         return charts.around
 
@@ -124,12 +124,12 @@ def reach_in_charts(charts: Charts, in_space: Reach, is_extrinsic: np.ndarray | 
         outside = is_extrinsic[which]
         if not outside.any():
             return charts.around(which, rings)
-        parts = [(outside, in_space), (~outside, charts.around)]
-        found = [(np.flatnonzero(mask), find(which[mask], rings)) for mask, find in parts]
+        choices = [(outside, in_space), (~outside, charts.around)]
+        parts = [(np.flatnonzero(mask), find(which[mask], rings)) for mask, find in choices]
         return Neighbourhood.gather(
-            np.concatenate([where[part.owners] for where, part in found]),
+            np.concatenate([index[part.owners] for index, part in parts]),
             len(which),
-            *(np.concatenate([getattr(part, name) for _, part in found]) for name in ("members", "lifted", "paths")),
+            *(np.concatenate([getattr(part, name) for _, part in parts]) for name in ("members", "lifted", "paths")),
         )
 
     return reach
@@ -138,12 +138,18 @@ def reach_in_charts(charts: Charts, in_space: Reach, is_extrinsic: np.ndarray | 
 def fit_support(rings: Rows, degree: int, reach: Reach, watch: Watch) -> tuple[Rows, np.ndarray, np.ndarray]:
     """Rows that determine a polynomial fit.
 
-    A quadratic is fitted on the one-ring where that determines it, else on two rings, else on three. Higher degrees
-    use the nearest of three rings, twice as many as a fit needs, and all of them where those do not determine it; near
-    the corners of a boundary four or five rings.
+    A quadratic is fitted on one ring if that determines it, otherwise on two rings, otherwise on three. Higher degrees
+    use the nearest neighbours in three rings, twice as many as a fit needs. If these do not determine the fit, all
+    neighbours in three rings are used, and then four or five rings, as happens near corners of a boundary.
+
+    Args:
+        rings: the one-rings.
+        degree: degree of the polynomial.
+        reach: finds wider rings.
+        watch: shows progress.
 
     Returns:
-        The rows, the vertices for which the first choice was not enough, and those for which no choice was.
+        The rows, the vertices where the first choice did not determine the fit, and the vertices where no choice did.
     """
     choices = (
         [(1, None), (2, None), (3, None)]
@@ -161,8 +167,8 @@ def fit_support(rings: Rows, degree: int, reach: Reach, watch: Watch) -> tuple[R
                 is_used &= distance <= np.partition(distance, nearest - 1, axis=0)[nearest - 1]
                 lifted = np.where(is_used[..., None], lifted, 0)
             is_last = attempt == len(choices) - 1
-            enough = _PLACED if is_last else _WELL_PLACED[degree]
-            chosen.add(batch, candidates, paths, is_used, fit_quality(lifted, degree) > enough)
+            threshold = _PLACED if is_last else _WELL_PLACED[degree]
+            chosen.add(batch, candidates, paths, is_used, fit_quality(lifted, degree) > threshold)
         rows = chosen.replace(rows)
         remaining = chosen.insufficient()
         if attempt == 0:
@@ -171,7 +177,7 @@ def fit_support(rings: Rows, degree: int, reach: Reach, watch: Watch) -> tuple[R
 
 
 def fit_quality(lifted: np.ndarray, degree: int) -> np.ndarray:
-    """How well each lifted ring (K, N, 2) determines a polynomial of the degree, (N,); zero where it does not."""
+    """The smallest eigenvalue (N,) of the scaled moment matrix of each lifted ring (K, N, 2)."""
     moments, weights, _ = ring_moments(lifted, np.zeros(lifted.shape[1], np.int8), degree)
     matrix = np.moveaxis(moment_matrix(moments, weights), -1, 0)
     diagonal = np.einsum("nii->ni", matrix)
@@ -188,20 +194,21 @@ def nonnegative_support(
     watch: Watch,
     emphasis: float = 1.0,
 ) -> tuple[Rows, SupportRecord]:
-    """Rows on which the weights of an operator are non-negative: the one-ring, else what least squares picks.
+    """Rows on which the weights of an operator are non-negative, and a record of how they were chosen.
 
-    For a vertex whose one-ring has a negative weight, non-negative least squares solves the moment conditions on two
-    rings, then on three, with columns scaled by r^-4 so that near neighbours win. It uses at most five neighbours.
-    Where no ring has a consistent row, the row of least residual is kept: it is not consistent, but it is stable.
+    The one-ring is used where its weights are non-negative. Elsewhere, non-negative least squares solves the moment
+    conditions on two rings, then on three. Its columns are scaled by r^-4 to favour near neighbours, and at most five
+    neighbours get a positive weight. If no ring has a consistent row, the row with the smallest residual is used, which
+    is stable although it is not consistent.
 
     Args:
         rings: the one-rings.
-        is_good: (V,) whether the one-ring's weights are non-negative and consistent.
-        kinds: (V,) which conditions a vertex keeps.
-        targets: (5, V) or (5, 1) what the operator makes of x, y, xy, x^2, y^2.
-        reach: the wider rings.
-        watch: shows how far the choice has come.
-        emphasis: as in `jets.operator_weights`.
+        is_good: (V,) whether the weights on the one-ring are non-negative and consistent.
+        kinds: (V,) kind of each vertex, which selects its conditions.
+        targets: (5, V) or (5, 1) values of the operator on x, y, xy, x^2, y^2.
+        reach: finds wider rings.
+        watch: shows progress.
+        emphasis: see `jets.operator_weights`.
     """
     num_vertices = len(is_good)
     rows = rings
@@ -227,11 +234,11 @@ def nonnegative_support(
 def _nonnegative_rows(
     lifted: np.ndarray, kinds: np.ndarray, targets: np.ndarray, emphasis: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The neighbours least squares picks from lifted candidates (K, N, 2), as a mask (K, N), and the residuals (N,)."""
+    """The neighbours that least squares selects from lifted candidates (K, N, 2), as a mask, and the residuals (N,)."""
     is_picked = np.sum(lifted**2, axis=-1) > 0
     residual = np.ones(len(kinds))
-    # The moments are scaled by the radius of the row, which is known only once it is picked. Where the row is exact the
-    # scale is of no account and one pass is enough; elsewhere the passes settle on the row that the weights recompute.
+    # The moments are scaled by the radius of the row, which depends on the selection. If the row is exact, the scale
+    # does not matter and one pass suffices. Otherwise the passes converge to the row that the weights recompute.
     todo = np.flatnonzero(is_picked.any(axis=0))
     for _ in range(LARGEST_RING):
         moments, weights, scale = ring_moments(
@@ -240,10 +247,10 @@ def _nonnegative_rows(
         target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
         matrices = np.ascontiguousarray(np.moveaxis(moments * weights[None], -1, 0))
         c, has_failed = np.zeros(weights.shape), np.zeros(len(todo), bool)
-        for i, (matrix, right) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
+        for i, (matrix, right_hand_side) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
             try:
-                c[:, i] = nnls(matrix, right)[0]
-            except RuntimeError:  # SciPy's iteration did not end
+                c[:, i] = nnls(matrix, right_hand_side)[0]
+            except RuntimeError:  # SciPy's iteration did not converge
                 has_failed[i] = True
         reached = np.einsum("ikn,kn->in", moments, weights * c)
         residual[todo] = relative_residual(target[None], reached[None], emphasis)[0]
@@ -259,31 +266,35 @@ def _nonnegative_rows(
 def _candidates(
     vertices: np.ndarray, rings: Rows, ring: int, reach: Reach, watch: Watch
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """The rings of some vertices, a batch at a time: vertices (N,), neighbours (K, N), padded with the vertex, their
-    places (K, N, 2), padded with zeros, and their paths (K, N, R)."""
+    """The rings of some vertices, one batch at a time.
+
+    Yields:
+        The vertices (N,), their neighbours (K, N), padded with the vertex itself, the positions of the neighbours
+        (K, N, 2), padded with zeros, and the paths to them (K, N, R).
+    """
     lengths = np.diff(rings.offsets)[vertices]
-    # Rings of about the same size together, so that a pole of valence 500 pads only rows of its own size.
+    # Group rings of similar size, so that a pole of valence 500 pads only rows of its own size.
     vertices = vertices[np.argsort(lengths, kind="stable")]
     batches = [vertices[start : start + _BATCH] for start in range(0, len(vertices), _BATCH)]
     for batch in watch(batches):
         around = reach(batch, ring)
         sizes = np.diff(around.offsets)
-        # A long row must not pad the whole batch.
+        # Split the batch by size, so that a long row does not pad all of it.
         by_size = np.argsort(sizes, kind="stable")
         cuts = np.flatnonzero(np.diff(np.ceil(np.log2(np.maximum(sizes[by_size], 16))))) + 1
-        # An empty slot reads one more entry, behind the last.
-        places = np.append(around.lifted, np.zeros((1, 2)), axis=0)
+        # Empty slots read one additional entry at the end.
+        positions = np.append(around.lifted, np.zeros((1, 2)), axis=0)
         paths = np.append(around.paths, np.zeros((1, around.paths.shape[1]), np.int32), axis=0)
         for part in np.split(by_size, cuts):
             slot = np.arange(sizes[part].max(initial=0))[:, None]
             is_used = slot < sizes[part]
             entry = np.where(is_used, around.offsets[part] + slot, len(around.members))
             own = batch[part]
-            yield own, np.where(is_used, np.append(around.members, 0)[entry], own), places[entry], paths[entry]
+            yield own, np.where(is_used, np.append(around.members, 0)[entry], own), positions[entry], paths[entry]
 
 
 class _Chosen:
-    """Rows chosen for some of the vertices, batch by batch."""
+    """Rows chosen for some vertices, collected batch by batch."""
 
     def __init__(self):
         self._vertices, self._entries, self._is_good = [], [], []
@@ -291,20 +302,20 @@ class _Chosen:
     def add(
         self, vertices: np.ndarray, candidates: np.ndarray, paths: np.ndarray, is_used: np.ndarray, is_good: np.ndarray
     ) -> None:
-        """The used ones of the candidates (K, N) of vertices (N,), their paths, and whether each row suffices."""
+        """Adds the used candidates (K, N) of vertices (N,), with their paths, and whether each row is sufficient."""
         column, slot = np.nonzero(is_used.T)
         self._vertices.append(vertices)
         self._entries.append((vertices[column], candidates[slot, column], paths[slot, column]))
         self._is_good.append(is_good)
 
     def insufficient(self) -> np.ndarray:
-        """The vertices whose row does not suffice."""
+        """The vertices whose rows are not sufficient."""
         if not self._vertices:
             return np.zeros(0, np.int64)
         return np.sort(np.concatenate(self._vertices)[~np.concatenate(self._is_good)])
 
     def replace(self, rows: Rows) -> Rows:
-        """All rows, with those of these vertices replaced."""
+        """All rows, with the chosen ones replaced."""
         if not self._vertices:
             return rows
         owners, members, paths = map(np.concatenate, zip(*self._entries, strict=True))
