@@ -241,7 +241,8 @@ def test_free_vertices_give_a_stationary_field_a_prescribed_value_and_triangles_
     before = float(warmth(dict(move=0 * x)))
     fit = ltl.fit(
         warmth, dict(move=np.zeros(x.shape)), ltl.Observations(1.3 * before, 1e-3 * before),
-        penalty=lambda p: [ltl.inverse.smoothness(small, p["move"][:, k], order=2) for k in range(3)], max_iterations=80,
+        penalty=lambda p: [ltl.inverse.smoothness(small, p["move"][:, k], order=2) for k in range(3)],
+        max_iterations=80,
     )  # fmt: skip
     vertices = np.asarray(x + fit.params["move"])
     rebuilt = ltl.Surface.from_mesh(ltl.Mesh(vertices, faces))

@@ -43,7 +43,14 @@ def commands(inputs):
     def solve(folder):
         surface = ltl.Surface.from_mesh(mesh)
         try:
-            ltl.solve(ltl.Diffusion(), surface, surface.vertices[:, 0], 0.1, dt=0.05, checkpoint_dir=folder)
+            ltl.solve(
+                ltl.Diffusion(),
+                surface,
+                surface.vertices[:, 0],
+                0.1,
+                dt=0.05,
+                checkpoints=ltl.solvers.Checkpoints(folder),
+            )
         except OutputError:
             return 2
         return 0

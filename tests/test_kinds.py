@@ -39,9 +39,9 @@ def test_the_error_for_a_mesh_in_place_of_a_surface_shows_how_to_build_a_surface
     ("change", "message"),
     [
         (dict(equation="heat"), r"Expected an equation such as ltl\.Diffusion\(\), found 'heat'"),
-        (dict(solver="euler"), r"Expected as solver an instance such as ltl\.RKL2\(\), found 'euler'"),
-        (dict(solver=ltl.RKL2), r"Expected as solver an instance .* found the class RKL2"),
-        (dict(adjoint="reverse"), "Expected as adjoint an instance"),
+        (dict(solver="euler"), r"Expected solver as an instance such as ltl\.RKL2\(\), found 'euler'"),
+        (dict(solver=ltl.RKL2), r"Expected solver as an instance .* found the class RKL2"),
+        (dict(adjoint="reverse"), "Expected adjoint as an instance"),
         (dict(t1=(0, 1)), r"Expected t1 as one number, found an array of shape \(2,\)"),
         (dict(t1="1"), "Expected t1 as real numbers, found type <U1"),
         (dict(t1=None), "Expected t1 as real numbers, found None"),

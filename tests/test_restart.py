@@ -1,4 +1,4 @@
-"""Runs that are kept on disk go on from there to the same end, whenever they were killed."""
+"""A run kept on disk is resumed to the same result, whenever it was killed."""
 
 import functools
 import itertools
@@ -19,6 +19,7 @@ import ltljax as ltl
 from ltljax._base.folder import Folder
 from ltljax._solve.fingerprint import fingerprint
 from ltljax.app import scenario
+from ltljax.solvers import Checkpoints
 
 RUN = """
 import sys
@@ -27,37 +28,37 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import ltljax as ltl
 
-surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(3))
+surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
 x = surface.vertices
 u0 = jax.numpy.stack([1 - 0.5 * jax.numpy.exp(-4 * x[:, 0] ** 2), 0.5 * jax.numpy.exp(-4 * x[:, 0] ** 2)], axis=1)
 equation = ltl.ReactionDiffusion((0.02, 0.01), ltl.kinetics.gray_scott())
 solution = ltl.solve(
-    equation, surface, u0, float(sys.argv[3]), dt=0.01, checkpoint_dir=sys.argv[1], checkpoint_every=0.1, resume=True
+    equation, surface, u0, float(sys.argv[3]), dt=0.01,
+    checkpoints=ltl.solvers.Checkpoints(sys.argv[1], every=0.1, resume=True),
 )
 np.save(sys.argv[2], solution.u_end)
 """
 
 
 def latest(folder):
-    """The number of the last state in a folder; -1 where there is none."""
+    """The number of the last state in a folder, or -1 if there is none."""
     return max((int(path.stem.removeprefix("state_")) for path in folder.glob("state_*.npz")), default=-1)
 
 
 def start(folder, end, intervals):
     command = [sys.executable, "-c", RUN, str(folder), str(end), str(0.1 * intervals)]
-    # A pipe that nobody reads would fill up with warnings, and the process would wait for ever.
-    with said_in(end).open("w") as said:
-        return subprocess.Popen(command, stderr=said)
+    # An unread pipe would fill up with warnings and block the process.
+    with log_of(end).open("w") as log:
+        return subprocess.Popen(command, stderr=log)
 
 
-def said_in(end):
-    """The file that holds what the process that writes ``end`` says on standard error."""
+def log_of(end):
+    """The file for the standard error of the process that writes ``end``."""
     return end.with_suffix(".log")
 
 
 def killed_and_resumed(tmp_path, kills, intervals, signals=(signal.SIGKILL,)):
-    """The end of a run that was not interrupted, and of one that was killed that many times on its way, by each of the
-    signals in turn."""
+    """The final states of an undisturbed run and of one that was killed several times, by each signal in turn."""
     whole, pieces, folder = tmp_path / "whole.npy", tmp_path / "pieces.npy", tmp_path / "b"
     undisturbed = start(tmp_path / "a", whole, intervals)
     chance = random.Random(0)
@@ -67,17 +68,17 @@ def killed_and_resumed(tmp_path, kills, intervals, signals=(signal.SIGKILL,)):
         process = start(folder, pieces, intervals)
         while latest(folder) < until and process.poll() is None:
             time.sleep(1e-3)
-        time.sleep(chance.uniform(0.0, 0.02))  # anywhere in what an interval does
+        time.sleep(chance.uniform(0.0, 0.02))  # at any point of an interval
         process.send_signal(stop)
         assert process.wait() != 0
         assert begun < latest(folder) < intervals - 1
     for process, end in ((undisturbed, whole), (start(folder, pieces, intervals), pieces)):
-        assert process.wait() == 0, said_in(end).read_text()
+        assert process.wait() == 0, log_of(end).read_text()
     return np.load(whole), np.load(pieces)
 
 
-def test_a_killed_run_goes_on_to_the_same_bits(tmp_path):
-    whole, pieces = killed_and_resumed(tmp_path, 2, 80)
+def test_a_killed_run_is_resumed_to_the_same_bits(tmp_path):
+    whole, pieces = killed_and_resumed(tmp_path, 1, 200)
     assert np.array_equal(whole, pieces)
 
 
@@ -85,7 +86,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
 @pytest.mark.slow
-def test_a_run_killed_twenty_times_goes_on_to_the_same_bits(tmp_path):
+def test_a_run_killed_twenty_times_is_resumed_to_the_same_bits(tmp_path):
     whole, pieces = killed_and_resumed(tmp_path, 20, 2000, SIGNALS)
     assert np.array_equal(whole, pieces)
 
@@ -121,8 +122,8 @@ time = 60
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "kills"), [("run", 10), ("fit", 10)])
-def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, kills):
-    """Of a run the last state, of a fit the numbers found, are those of a command that was left alone."""
+def test_a_command_killed_ten_times_is_resumed_to_the_same_bits(tmp_path, command, kills):
+    """The last state of a run, and the parameters of a fit, are those of an undisturbed command."""
     (tmp_path / "mine.toml").write_text(FITTED if command == "fit" else SCENARIO)
     example = scenario.read(SCENARIO.replace("end = 2000", "end = 60"), "mine.toml", tmp_path)
     surface = ltl.Surface.from_mesh(example.mesh)
@@ -136,8 +137,8 @@ def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, 
         return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def end(process):
-        said = process.communicate()[1]
-        assert process.returncode == 0, said
+        errors = process.communicate()[1]
+        assert process.returncode == 0, errors
 
     end(begin(tmp_path / "whole"))
     chance, restart = random.Random(1), tmp_path / "pieces" / "restart"
@@ -156,36 +157,55 @@ def test_a_command_killed_ten_times_goes_on_to_the_same_bits(tmp_path, command, 
     assert killed >= kills // 2
     end(begin(tmp_path / "pieces", *(["--resume"] if restart.exists() else [])))
     if command == "run":
-        one, other = (tmp_path / out / "series" / "mine_0100.vtp" for out in ("whole", "pieces"))
-        assert one.read_bytes() == other.read_bytes()
+        whole, pieces = (tmp_path / out / "series" / "mine_0100.vtp" for out in ("whole", "pieces"))
+        assert whole.read_bytes() == pieces.read_bytes()
     else:
-        one, other = (json.loads((tmp_path / out / "fit.json").read_text()) for out in ("whole", "pieces"))
-        assert one["found"] == other["found"]
+        whole, pieces = (json.loads((tmp_path / out / "fit.json").read_text()) for out in ("whole", "pieces"))
+        assert whole["found"] == pieces["found"]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def case():
-    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2))
+    surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(1))
     return ltl.Diffusion(source=surface.vertices[:, 0]), surface, jnp.zeros(surface.num_vertices)
 
 
 @pytest.mark.parametrize("how", [dict(dt=0.05), dict()], ids=["fixed", "adaptive"])
-def test_a_run_in_intervals_is_the_run(case, tmp_path, how):
+def test_a_run_in_intervals_equals_the_plain_run(case, tmp_path, how):
     equation, surface, u0 = case
-    how = dict(ts=[0.3, 0.5, 1.0], rtol=1e-7, atol=1e-9) | how
-    plain = ltl.solve(equation, surface, u0, 1.0, **how)
-    kept = ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path, **how)
-    again = ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path, resume=True, **how)
-    np.testing.assert_allclose(kept.us, plain.us, atol=1e-6)
-    np.testing.assert_array_equal(again.us, kept.us)
-    np.testing.assert_allclose(again.ts, plain.ts)
-    assert again.counts == kept.counts
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, ts=[0.3, 0.5, 1.0], rtol=1e-7, atol=1e-9, **how)
+    plain = run()
+    stored = run(checkpoints=Checkpoints(tmp_path))
+    resumed = run(checkpoints=Checkpoints(tmp_path, resume=True))
+    np.testing.assert_allclose(stored.us, plain.us, atol=1e-6)
+    np.testing.assert_array_equal(resumed.us, stored.us)
+    np.testing.assert_allclose(resumed.ts, plain.ts)
+    assert resumed.counts == stored.counts
+
+
+def test_old_keywords_still_work_and_warn(case, tmp_path):
+    equation, surface, u0 = case
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, dt=0.1)
+    with pytest.warns(
+        DeprecationWarning, match=r"The argument checkpoint_\w+ of solve .* use checkpoints=ltl\.solvers"
+    ):
+        old = run(checkpoint_dir=tmp_path, checkpoint_every=0.5)
+    resumed = run(checkpoints=Checkpoints(tmp_path, every=0.5, resume=True))
+    np.testing.assert_array_equal(old.us, resumed.us)
+    for option, message in ((dict(resume=True), "resume=True"), (dict(checkpoint_every=0.1), "checkpoint_every=0.1")):
+        with (
+            pytest.warns(DeprecationWarning, match="of solve"),
+            pytest.raises(ValueError, match=f"{message} needs the folder"),
+        ):
+            run(**option)
+    with pytest.raises(ValueError, match="positive length of intervals, found every = 0"):
+        Checkpoints(tmp_path, every=0)
 
 
 def test_files_of_another_run_are_refused(case, tmp_path):
     equation, surface, u0 = case
-    ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path)
-    other_mesh = ltl.Surface.from_mesh(ltl.shapes.icosphere(2, radius=2.0))
+    ltl.solve(equation, surface, u0, 1.0, checkpoints=Checkpoints(tmp_path))
+    other_mesh = ltl.Surface.from_mesh(ltl.shapes.icosphere(1, radius=2.0))
     for name, call in {
         "mesh": (equation, other_mesh, u0, 1.0),
         "equation": (ltl.Diffusion(2.0, source=surface.vertices[:, 0]), surface, u0, 1.0),
@@ -193,42 +213,43 @@ def test_files_of_another_run_are_refused(case, tmp_path):
         "end": (equation, surface, u0, 2.0),
     }.items():
         with pytest.raises(ltl.errors.RestartError, match=f"another {name}"):
-            ltl.solve(*call, checkpoint_dir=tmp_path, resume=True)
+            ltl.solve(*call, checkpoints=Checkpoints(tmp_path, resume=True))
 
 
-def test_a_run_goes_on_from_before_what_is_damaged(case, tmp_path):
+def test_a_run_goes_on_from_before_a_damaged_state(case, tmp_path):
     equation, surface, u0 = case
-    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, ts=[0.2, 1.0], checkpoint_dir=tmp_path)
-    whole = run()
-    asked = tmp_path / "state_000003.npz"
-    content = asked.read_bytes()
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, ts=[0.2, 1.0])
+    whole = run(checkpoints=Checkpoints(tmp_path))
+    resume = Checkpoints(tmp_path, resume=True)
+    requested = tmp_path / "state_000003.npz"
+    content = requested.read_bytes()
     for damaged in (content[:50], content[: len(content) // 2] + b"x" * 30 + content[len(content) // 2 + 30 :], b""):
-        asked.write_bytes(damaged)
-        with pytest.warns(UserWarning, match=r"Passed over in .*: state_000003\.npz"):
-            np.testing.assert_array_equal(run(resume=True).us, whole.us)
-        assert asked.read_bytes() == damaged
-        # The state was made again under another name.
+        requested.write_bytes(damaged)
+        with pytest.warns(UserWarning, match=r"Damaged files in .* were skipped: state_000003\.npz"):
+            np.testing.assert_array_equal(run(checkpoints=resume).us, whole.us)
+        assert requested.read_bytes() == damaged
+        # The state was computed again and stored under another name.
         for state in tmp_path.glob("state_*.npz"):
             state.unlink()
-        asked.write_bytes(content)
-    asked.unlink()
-    np.testing.assert_array_equal(run(resume=True).us, whole.us)
+        requested.write_bytes(content)
+    requested.unlink()
+    np.testing.assert_array_equal(run(checkpoints=resume).us, whole.us)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ltl.errors.RestartError, match=r"run\.json was damaged"):
-        run(resume=True)
+        run(checkpoints=resume)
 
 
 @pytest.mark.parametrize("count", [1100, pytest.param(11_000, marks=pytest.mark.slow)])
 def test_a_damaged_state_never_leads_to_another_result(case, tmp_path, count):
     equation, surface, u0 = case
-    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, dt=0.1, checkpoint_dir=tmp_path)
-    whole = np.asarray(run(checkpoint_every=0.5).u_end)
-    keep = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, dt=0.1)
+    whole = np.asarray(run(checkpoints=Checkpoints(tmp_path, every=0.5)).u_end)
+    intact = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
     folder, chance = Folder(tmp_path), random.Random(0)
-    # Flipped bits, and one truncation in eleven. None counts as a state that was written; a run goes on from four.
+    # Each turn flips a bit, or truncates in one of eleven turns. No such file passes for intact; four are resumed from.
     for turn in range(count):
-        name = chance.choice(sorted(keep))
-        content = bytearray(keep[name])
+        name = chance.choice(sorted(intact))
+        content = bytearray(intact[name])
         if turn % 11:
             content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
         else:
@@ -236,13 +257,14 @@ def test_a_damaged_state_never_leads_to_another_result(case, tmp_path, count):
         (tmp_path / name).write_bytes(content)
         assert not folder.owns(name)
         if turn % (count // 4) == 0:
-            with pytest.warns(UserWarning, match="Passed over"):
-                np.testing.assert_array_equal(run(checkpoint_every=0.5, resume=True).u_end, whole)
+            with pytest.warns(UserWarning, match="were skipped"):
+                resumed = run(checkpoints=Checkpoints(tmp_path, every=0.5, resume=True))
+            np.testing.assert_array_equal(resumed.u_end, whole)
             for path in tmp_path.glob("state_*.npz"):
                 path.unlink()
-            for other, was in keep.items():
-                (tmp_path / other).write_bytes(was)
-        (tmp_path / name).write_bytes(keep[name])
+            for other, original in intact.items():
+                (tmp_path / other).write_bytes(original)
+        (tmp_path / name).write_bytes(intact[name])
 
 
 def test_a_run_that_has_not_ended_is_not_erased(case, tmp_path):
@@ -255,19 +277,19 @@ def test_a_run_that_has_not_ended_is_not_erased(case, tmp_path):
         jax.debug.callback(lambda now: (_ for _ in ()).throw(Stopped) if now > 0.45 else None, t)
         return jnp.array(False)
 
-    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, dt=0.05, checkpoint_dir=tmp_path)
+    run = functools.partial(ltl.solve, equation, surface, u0, 1.0, dt=0.05)
     with pytest.raises(Exception, match="Stopped"):
-        run(checkpoint_every=0.1, stop_when=stop)
+        run(checkpoints=Checkpoints(tmp_path, every=0.1), stop_when=stop)
     states = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
     assert states
     with pytest.raises(
         ltl.errors.RestartError, match=r"holds a run that has not ended, at t = 0\.\d+\. Go on with resume=True"
     ):
-        run()
+        run(checkpoints=Checkpoints(tmp_path))
     assert states == {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
 
 
-def test_states_of_another_program_are_refused_by_name_and_kept(case, tmp_path):
+def test_files_of_another_program_are_named_in_the_error_and_kept(case, tmp_path):
     equation, surface, u0 = case
     for name in ("state_000000.npz", "state_000007.npz", "run.json"):
         folder = tmp_path / name
@@ -275,53 +297,53 @@ def test_states_of_another_program_are_refused_by_name_and_kept(case, tmp_path):
         (folder / name).write_bytes(b"mine")
         for resume in (False, True):
             with pytest.raises(ValueError, match=name.replace(".", r"\.")):
-                ltl.solve(equation, surface, u0, 0.5, checkpoint_dir=folder, resume=resume)
+                ltl.solve(equation, surface, u0, 0.5, checkpoints=Checkpoints(folder, resume=resume))
         assert (folder / name).read_bytes() == b"mine"
 
 
 def test_a_second_run_in_a_folder_in_use_is_refused(case, tmp_path):
     equation, surface, u0 = case
     with Folder(tmp_path).locked(), pytest.raises(ValueError, match="Another run is writing"):
-        ltl.solve(equation, surface, u0, 0.5, checkpoint_dir=tmp_path)
+        ltl.solve(equation, surface, u0, 0.5, checkpoints=Checkpoints(tmp_path))
 
 
-def test_starting_anew_leaves_other_files_alone(case, tmp_path):
+def test_a_new_run_leaves_other_files_alone(case, tmp_path):
     equation, surface, u0 = case
     (tmp_path / "notes.txt").write_text("mine")
-    ltl.solve(equation, surface, u0, 0.5, checkpoint_dir=tmp_path)
-    ltl.solve(equation, surface, u0, 1.0, checkpoint_dir=tmp_path)
+    ltl.solve(equation, surface, u0, 0.5, checkpoints=Checkpoints(tmp_path))
+    ltl.solve(equation, surface, u0, 1.0, checkpoints=Checkpoints(tmp_path))
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_the_folder_holds_the_last_states_and_those_asked_for(case, tmp_path):
+def test_the_folder_holds_the_last_states_and_the_requested_ones(case, tmp_path):
     equation, surface, u0 = case
-    ltl.solve(equation, surface, u0, 1.0, ts=[0.25, 0.5], checkpoint_dir=tmp_path, checkpoint_every=0.01)
+    ltl.solve(equation, surface, u0, 1.0, ts=[0.25, 0.5], checkpoints=Checkpoints(tmp_path, every=0.01))
     states = sorted(os.listdir(tmp_path))
     assert states == [".ltljax", "run.json", *(f"state_{number:06d}.npz" for number in (24, 49, 98, 99))]
 
 
 @pytest.mark.parametrize("how", [dict(dt=0.05), dict()], ids=["fixed", "adaptive"])
-def test_no_interval_is_of_rounding(case, tmp_path, how):
+def test_rounding_makes_no_extra_interval(case, tmp_path, how):
     equation, surface, u0 = case
-    # A tenth three times is not three tenths.
-    ltl.solve(equation, surface, u0, 0.9, ts=[0.3, 0.6, 0.9], checkpoint_dir=tmp_path, checkpoint_every=0.1, **how)
+    # Three times 0.1 is not 0.3.
+    ltl.solve(equation, surface, u0, 0.9, ts=[0.3, 0.6, 0.9], checkpoints=Checkpoints(tmp_path, every=0.1), **how)
     assert sorted(os.listdir(tmp_path))[-1] == "state_000008.npz"
 
 
-def test_a_fingerprint_is_of_what_a_value_is():
-    def one(x, p):
+def test_a_fingerprint_tells_values_apart():
+    def plus(x, p):
         return x + p
 
-    def other(x, p):
+    def minus(x, p):
         return x - p
 
     assert fingerprint(ltl.Diffusion(1.0)) == fingerprint(ltl.Diffusion(1.0))
     assert fingerprint(ltl.Diffusion(1.0)) != fingerprint(ltl.Diffusion(2.0))
-    assert fingerprint(one) != fingerprint(other)
+    assert fingerprint(plus) != fingerprint(minus)
     assert fingerprint(np.zeros(3)) != fingerprint(np.zeros((3, 1)))
 
 
-def test_a_fingerprint_is_of_a_functions_source_and_values():
+def test_a_fingerprint_covers_the_source_and_the_values_of_a_function():
     def with_default(rate):
         return lambda x, rate=rate: rate * x
 
@@ -347,7 +369,7 @@ def scaled_by(factor):
     return decorated
 
 
-def test_a_fingerprint_sees_decorators_and_which_value_is_where():
+def test_a_fingerprint_covers_decorators_and_the_order_of_values():
     def f(x):
         return x
 
@@ -368,14 +390,14 @@ def test_a_run_of_functions_without_a_source_needs_a_name(case, tmp_path):
     names = {}
     exec("def kinetics(s, p): return (-s[0],)", names)
     equation = ltl.ReactionDiffusion((0.1,), names["kinetics"])
-    u0, how = u0[:, None], dict(checkpoint_dir=tmp_path, dt=0.1)
+    run = functools.partial(ltl.solve, equation, surface, u0[:, None], 0.2, dt=0.1)
     with pytest.raises(ltl.errors.RestartError, match=r"source of the function kinetics is not available.*run_id"):
-        ltl.solve(equation, surface, u0, 0.2, **how)
-    named = ltl.solve(equation, surface, u0, 0.2, run_id="decay", **how)
-    again = ltl.solve(equation, surface, u0, 0.2, run_id="decay", resume=True, **how)
-    np.testing.assert_array_equal(named.u_end, again.u_end)
+        run(checkpoints=Checkpoints(tmp_path))
+    named = run(checkpoints=Checkpoints(tmp_path, run_id="decay"))
+    resumed = run(checkpoints=Checkpoints(tmp_path, run_id="decay", resume=True))
+    np.testing.assert_array_equal(named.u_end, resumed.u_end)
     with pytest.raises(ltl.errors.RestartError, match="another equation"):
-        ltl.solve(equation, surface, u0, 0.2, run_id="growth", resume=True, **how)
+        run(checkpoints=Checkpoints(tmp_path, run_id="growth", resume=True))
 
 
 class Opaque:
@@ -386,16 +408,15 @@ class Opaque:
         return self.rate * x
 
 
-def tells_apart(x):
+def is_pattern(x):
     return x in {"spots", "stripes", "holes", "waves"}
 
 
 PRINT = """
 import sys
 sys.path.insert(0, sys.argv[1])
-import test_restart as here
-from ltljax._solve.fingerprint import fingerprint
-print(fingerprint([here.tells_apart, here.Opaque(1.0), here.ltl.RKL2(), here.np.float32]))
+from test_restart import Opaque, fingerprint, is_pattern, ltl, np
+print(fingerprint([is_pattern, Opaque(1.0), ltl.RKL2(), np.float32]))
 """
 
 
@@ -405,12 +426,12 @@ def test_a_fingerprint_is_the_same_in_every_process():
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONHASHSEED": seed})
         for seed in ("1", "2")
     ]
-    one, other = (process.communicate()[0] for process in processes)
+    first, second = (process.communicate()[0] for process in processes)
     assert [process.returncode for process in processes] == [0, 0]
-    assert one == other
+    assert first == second
 
 
-def test_a_fingerprint_sees_objects_and_containers():
+def test_a_fingerprint_covers_objects_and_containers():
     assert fingerprint(Opaque(1.0)) == fingerprint(Opaque(1.0))
     assert fingerprint(Opaque(1.0)) != fingerprint(Opaque(2.0))
     assert fingerprint((12, 3)) != fingerprint((1, 23))
@@ -419,19 +440,19 @@ def test_a_fingerprint_sees_objects_and_containers():
         fingerprint(x for x in ())
 
 
-def test_a_run_of_no_length_is_kept_too(case, tmp_path):
+def test_a_run_of_zero_length_can_be_kept(case, tmp_path):
     equation, surface, u0 = case
-    found = ltl.solve(equation, surface, u0, 0.0, checkpoint_dir=tmp_path, dt=0.1)
-    np.testing.assert_array_equal(found.u_end, u0)
+    solution = ltl.solve(equation, surface, u0, 0.0, checkpoints=Checkpoints(tmp_path), dt=0.1)
+    np.testing.assert_array_equal(solution.u_end, u0)
 
 
-def test_an_overflow_is_kept_and_said_again(case, tmp_path):
+def test_an_overflow_is_reported_again_on_resume(case, tmp_path):
     _, surface, _ = case
     explosive = ltl.ReactionDiffusion((0.1,), lambda s, p: (s[0] ** 2 + p,), params=jnp.array(1.0))
     u0 = jnp.zeros((surface.num_vertices, 1))
     for resume in (False, True):
         with pytest.raises(ltl.SolveError, match=r"overflowed at t = 1\.57"):
-            ltl.solve(explosive, surface, u0, 5.0, checkpoint_dir=tmp_path, resume=resume)
+            ltl.solve(explosive, surface, u0, 5.0, checkpoints=Checkpoints(tmp_path, resume=resume))
 
 
 class Doubled:
@@ -443,18 +464,18 @@ class Doubled:
         return self.factor * x
 
 
-def test_a_fingerprint_sees_the_object_of_a_decorated_method():
+def test_a_fingerprint_covers_the_object_of_a_decorated_method():
     assert fingerprint(Doubled(1.0).__call__) != fingerprint(Doubled(2.0).__call__)
 
 
 def test_states_without_their_description_are_neither_erased_nor_resumed(case, tmp_path):
     equation, surface, u0 = case
-    run = functools.partial(ltl.solve, equation, surface, u0, 0.5, dt=0.1, checkpoint_dir=tmp_path)
-    run()
+    run = functools.partial(ltl.solve, equation, surface, u0, 0.5, dt=0.1)
+    run(checkpoints=Checkpoints(tmp_path))
     states = {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}
     (tmp_path / "run.json").unlink()
-    with pytest.raises(ltl.errors.RestartError, match="which says what run made them"):
-        run(resume=True)
+    with pytest.raises(ltl.errors.RestartError, match="that says which run made them"):
+        run(checkpoints=Checkpoints(tmp_path, resume=True))
     with pytest.raises(ltl.errors.RestartError, match="holds a run that has not ended"):
-        run()
+        run(checkpoints=Checkpoints(tmp_path))
     assert states == {path.name: path.read_bytes() for path in tmp_path.glob("state_*.npz")}

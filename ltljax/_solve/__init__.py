@@ -3,16 +3,18 @@ multigrid, eigenmodes, and what linear theory says before a run."""
 
 from .direct import Factorized, factorized
 from .distance import geodesic_distance
-from .elliptic import IncompatibleSourceWarning, poisson, screened_poisson
-from .evolve import GrowingModesWarning, Solution, SolveError, Steady, solve
+from .evolve import GrowingModesWarning, solve
 from .hodge import HarmonicFields, HodgeParts, harmonic_fields, helmholtz_hodge
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
 from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
-from .restart import RestartError
+from .poisson import IncompatibleSourceWarning, poisson, screened_poisson
+from .restart import Checkpoints, RestartError
+from .solution import Solution, SolveError, Steady
 from .stabilised import RKL1, RKL2
 from .stability import Dispersion, Explanation, dispersion, explain
 from .stationary import steady_state
+from .stepping import Adaptive, Fixed
 from .vector_heat import connection_matrix, direction_field, transport_vectors
 
 __all__ = [
@@ -20,12 +22,15 @@ __all__ = [
     "RKL2",
     "SBDF2",
     "TRBDF2",
+    "Adaptive",
     "BackwardEuler",
+    "Checkpoints",
     "CrankNicolson",
     "Dispersion",
     "Eigenmodes",
     "Explanation",
     "Factorized",
+    "Fixed",
     "GrowingModesWarning",
     "HarmonicFields",
     "HodgeParts",

@@ -1,8 +1,9 @@
-"""What is wrong with a run before it starts: each mistake one clear error (host)."""
+"""Checks of the arguments of a run before it starts: each mistake raises one clear error (host)."""
 
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,14 +15,20 @@ from .._equations import Equation
 from .._operators import EllipticStencil
 from .._surface import Surface
 from .._tables import AnyArray
+from .multigrid import Multigrid
 from .stabilised import Stabilised
 
-# Products with the rate's derivative from which the stiffest mode is estimated.
-_PRODUCTS = 30
+# Number of power iterations with which the stiffest mode is estimated.
+_POWER_ITERATIONS = 30
 
 
 def field(surface: Surface, u: Any, name: str) -> Array:
-    """A field over a surface as an array (V,) or (V, S) in its float type, if it is one."""
+    """A field over a surface as an array (V,) or (V, S) in the dtype of the surface.
+
+    Raises:
+        TypeError: the field is None.
+        ValueError: the field does not fit the surface.
+    """
     if u is None:
         raise TypeError(f"Expected {name} as real numbers, found None.")
     u = jnp.asarray(as_numbers(name, u), surface.dtype)
@@ -29,8 +36,8 @@ def field(surface: Surface, u: Any, name: str) -> Array:
     return u
 
 
-def kinds(equation: Any, solver: Any, adjoint: Any, max_steps: Any, stop_when: Any) -> None:
-    """Raise where an argument of `solve` is of the wrong kind."""
+def kinds(equation: Any, solver: Any, adjoint: Any, preconditioner: Any, max_steps: Any, stop_when: Any) -> None:
+    """Raise an error if an argument of `solve` is of the wrong kind."""
     if not isinstance(equation, Equation):
         raise TypeError(f"Expected an equation such as ltl.Diffusion(), found {equation!r:.80}.")
     for name, value, kind, example in (
@@ -38,8 +45,13 @@ def kinds(equation: Any, solver: Any, adjoint: Any, max_steps: Any, stop_when: A
         ("adjoint", adjoint, diffrax.AbstractAdjoint, "diffrax.ForwardMode()"),
     ):
         if value is not None and not isinstance(value, kind):
-            what = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.80}"
-            raise TypeError(f"Expected as {name} an instance such as {example}, found {what}.")
+            description = f"the class {value.__name__}" if isinstance(value, type) else f"{value!r:.80}"
+            raise TypeError(f"Expected {name} as an instance such as {example}, found {description}.")
+    if preconditioner is not None and not isinstance(preconditioner, Multigrid):
+        raise TypeError(
+            "Expected preconditioner as the result of ltl.solvers.multigrid(surface), found "
+            f"{type(preconditioner).__name__}."
+        )
     if max_steps is not None:
         at_least("max_steps", max_steps, 1)
     if stop_when is not None and not callable(stop_when):
@@ -47,7 +59,7 @@ def kinds(equation: Any, solver: Any, adjoint: Any, max_steps: Any, stop_when: A
 
 
 def one_number(name: str, value: Any) -> None:
-    """Raise where a time or a length of steps is no single number."""
+    """Raise an error if a time or a step length is not a single number."""
     if value is None:
         raise TypeError(f"Expected {name} as real numbers, found None.")
     as_numbers(name, value)
@@ -56,7 +68,7 @@ def one_number(name: str, value: Any) -> None:
 
 
 def state(surface: Surface, u0: Array) -> None:
-    """Raise where a state does not fit the surface."""
+    """Raise an error if a state does not fit the surface."""
     if u0.ndim not in (1, 2) or u0.shape[0] != surface.num_vertices:
         raise ValueError(
             f"Expected a state of shape ({surface.num_vertices},) or ({surface.num_vertices}, S), found {u0.shape}."
@@ -64,45 +76,45 @@ def state(surface: Surface, u0: Array) -> None:
 
 
 def times(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None) -> None:
-    """Raise where the times of a run are not in order."""
+    """Raise an error if the times of a run are not in order."""
     if dt is not None and not isinstance(dt, Tracer) and not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"Expected a positive length of steps, found dt = {dt}.")
+        raise ValueError(f"Expected a positive step length, found dt = {dt}.")
     if any(isinstance(value, Tracer) for value in (t0, t1, ts)):
         return
-    start, end, asked = (np.asarray(value, ts.dtype) for value in (t0, t1, ts))
+    start, end, requested = (np.asarray(value, ts.dtype) for value in (t0, t1, ts))
     if not (np.isfinite(start) and np.isfinite(end) and end >= start):
         raise ValueError(f"Expected t1 at or after t0, found t0 = {start} and t1 = {end}.")
-    if asked.ndim != 1:
-        raise ValueError(f"Expected ts as a list of times, found an array of shape {asked.shape}.")
-    if not asked.size:
-        raise ValueError("Expected ts to hold at least one time, found none. Leave it out for the state at t1 alone.")
-    is_bad = ~((asked >= start) & (asked <= end))
+    if requested.ndim != 1:
+        raise ValueError(f"Expected ts as a list of times, found an array of shape {requested.shape}.")
+    if not requested.size:
+        raise ValueError("Expected at least one time in ts, found none. Leave ts out for the state at t1 alone.")
+    is_bad = ~((requested >= start) & (requested <= end))
     if is_bad.any():
         first = int(np.flatnonzero(is_bad)[0])
-        raise ValueError(f"Expected ts between t0 = {start} and t1 = {end}, found ts[{first}] = {asked[first]}.")
-    falls = np.flatnonzero(np.diff(asked) < 0)
-    if len(falls):
-        first = int(falls[0])
+        raise ValueError(f"Expected ts between t0 = {start} and t1 = {end}, found ts[{first}] = {requested[first]}.")
+    decreases = np.flatnonzero(np.diff(requested) < 0)
+    if len(decreases):
+        first = int(decreases[0])
         raise ValueError(
-            f"Expected ts in ascending order, found ts[{first + 1}] = {asked[first + 1]} after {asked[first]}."
+            f"Expected ts in ascending order, found ts[{first + 1}] = {requested[first + 1]} after {requested[first]}."
         )
 
 
 def tolerances(rtol: ArrayLike, atol: ArrayLike | None) -> None:
-    """Raise where tolerances are not positive."""
+    """Raise an error if a tolerance is not positive."""
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         if tolerance is None:
             continue
         as_numbers(name, tolerance)
         if not isinstance(tolerance, Tracer) and not np.all(np.isfinite(tolerance) & (np.asarray(tolerance) > 0)):
             raise ValueError(
-                f"Expected a positive tolerance, found {name} = {tolerance}: steps would have to be without error. For "
-                "steps of a length of your own give dt."
+                f"Expected a positive tolerance, found {name} = {tolerance}: no step is exact. For fixed steps, give "
+                "dt."
             )
 
 
 def finite(equation: Equation, u0: Array) -> None:
-    """Raise where the initial state or the numbers of an equation are not finite, or a diffusivity is negative."""
+    """Raise an error if the initial state or a value of the equation is not finite, or a diffusivity is negative."""
     if not isinstance(u0, Tracer):
         is_bad = ~np.isfinite(np.asarray(u0))
         if is_bad.any():
@@ -113,7 +125,7 @@ def finite(equation: Equation, u0: Array) -> None:
             continue
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"The equation's{jax.tree_util.keystr(path)} is not finite.")
-    # Fields too, whose mean is what `diffusivities` says; stencils have signs of their own.
+    # `diffusivities` gives only the means of fields, so the fields are checked too. Stencils may have any sign.
     for path, leaf in jax.tree_util.tree_leaves_with_path(equation, is_leaf=lambda x: isinstance(x, EllipticStencil)):
         is_spread = any(getattr(key, "name", None) in ("diffusivity", "mobility") for key in path)
         if is_spread and isinstance(leaf, float | np.ndarray | jax.Array):
@@ -123,7 +135,7 @@ def finite(equation: Equation, u0: Array) -> None:
 
 
 def _diffuses_forwards(diffusivity: ArrayLike, where: str, u0: Array) -> None:
-    """Raise where a diffusivity, a number or one for each species or vertex, is negative."""
+    """Raise an error if a diffusivity is negative: a number, or an array with one per species or vertex."""
     if isinstance(diffusivity, Tracer) or not (is_negative := np.asarray(diffusivity) < 0).any():
         return
     at = np.argwhere(is_negative)[0]
@@ -131,30 +143,30 @@ def _diffuses_forwards(diffusivity: ArrayLike, where: str, u0: Array) -> None:
     place = f" at {'vertex' if is_field else 'species'} {at[0]}" if at.size else ""
     raise ValueError(
         f"Expected diffusivities that are not negative, found {np.asarray(diffusivity)[tuple(at)]:g}{place}{where}: "
-        "diffusion backwards in time is not well posed. Where nothing diffuses give 0."
+        "backward diffusion is ill-posed. Use 0 where nothing diffuses."
     )
 
 
 def parts_of_a_step(
     equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, dt: float, solver: diffrax.AbstractSolver
 ) -> int:
-    """The number of equal parts to split a step into.
+    """The number of equal parts into which each fixed step is divided.
 
-    More than one where `RKL2` or `RKL1` is unstable for the whole step even with the most stages, judged by the
-    stiffest mode of the initial state; 1 where that is unknown.
+    It exceeds one if a whole step of `RKL2` or `RKL1` is unstable even with the most stages, judged by the stiffest
+    mode at the initial state. It is one if the stiffness is not known.
 
     Raises:
-        ValueError: the step is too long for an explicit method without stages to choose from.
+        ValueError: the step is too long for another explicit method.
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((equation, surface, u0, t0, dt))):
         return 1
-    # What is traced may be reached through a closure too.
+    # Tracers may also be reached through closures, so results are checked for them as well.
     t0 = jnp.asarray(t0, u0.dtype)
     if isinstance(solver, Stabilised):
         longest = solver.longest_step(solver.extent(t0, u0, (equation, surface)))
         if isinstance(longest, Tracer) or not (np.isfinite(longest) and longest > 0):
             return 1
-        # With a margin for the rounding of the times between parts.
+        # The margin allows for rounding of the times between parts.
         return 1 if dt <= longest else int(np.ceil(1.02 * dt / float(longest)))
     elif isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
         stiffest, width = _stiffest(equation, surface, u0, t0), equation.spectral_width(t0, surface, u0)
@@ -171,24 +183,25 @@ def parts_of_a_step(
     return 1
 
 
-@jax.jit
+@eqx.filter_jit
 def _power_iteration(equation: Equation, surface: Surface, u0: Array, t0: Array, v: Array) -> Array:
     def product(_, v):
-        change = jax.jvp(lambda u: equation.rate(t0, surface, u), (u0,), (v / jnp.linalg.norm(v),))[1]
-        return change
+        return jax.jvp(lambda u: equation.rate(t0, surface, u), (u0,), (v / jnp.linalg.norm(v),))[1]
 
-    return jnp.linalg.norm(jax.lax.fori_loop(0, _PRODUCTS, product, v))
+    return jnp.linalg.norm(jax.lax.fori_loop(0, _POWER_ITERATIONS, product, v))
 
 
 def _stiffest(equation: Equation, surface: Surface, u0: Array, t0: Array) -> Array:
-    """The magnitude of the largest eigenvalue of the rate's derivative, from below."""
+    """A lower bound of the largest magnitude of the eigenvalues of the rate's derivative."""
     start = jnp.asarray(np.random.default_rng(0).normal(size=u0.shape), u0.dtype)
     return _power_iteration(equation, surface, u0, t0, start)
 
 
 def longest_step(solver: diffrax.AbstractSolver, bound: float, width: float) -> float:
-    """The longest step with which an explicit Runge-Kutta method is stable where eigenvalues x + iy have ``-bound <= x
-    <= 0`` and ``y^2 <= width |x|``."""
+    """The longest stable step of an explicit Runge-Kutta method.
+
+    It is stable for all eigenvalues x + iy with ``-bound <= x <= 0`` and ``y^2 <= width |x|``.
+    """
     growth = _growth(solver)
     x = max(bound, 1e-30) * np.linspace(0, 1, 400)[1:]
     eigenvalues = -x + 1j * np.sqrt(width * x) * np.linspace(0, 1, 21)[:, None]
@@ -201,7 +214,7 @@ def longest_step(solver: diffrax.AbstractSolver, bound: float, width: float) -> 
 
 
 def _growth(solver: diffrax.AbstractSolver) -> np.polynomial.Polynomial:
-    """What a step of an explicit Runge-Kutta method multiplies exp(lambda t) with, as a polynomial of lambda dt."""
+    """The stability polynomial of an explicit Runge-Kutta method: the growth of exp(lambda t) in terms of lambda dt."""
     if isinstance(solver, diffrax.Euler):
         return np.polynomial.Polynomial([1, 1])
     tableau = solver.tableau  # type: ignore
@@ -209,7 +222,7 @@ def _growth(solver: diffrax.AbstractSolver) -> np.polynomial.Polynomial:
     a = np.zeros((size, size))
     for row, values in enumerate(tableau.a_lower, start=1):
         a[row, :row] = values
-    # R(z) = 1 + z b (I - z a)^-1 1, a polynomial since a is nilpotent.
+    # R(z) = 1 + z b (I - z a)^-1 1 is a polynomial because a is nilpotent.
     coefficients, powers = [1.0], np.ones(size)
     for _ in range(size):
         coefficients.append(tableau.b_sol @ powers)

@@ -21,8 +21,8 @@ from .._lifting.schemes import Paper
 from .._operators import laplacian_matrix
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
-from .evolve import what_is_fixed
 from .krylov import Preconditioner
+from .preconditioning import fixed_by_conditions
 
 # Number of factors that a surface keeps.
 _CACHED = 4
@@ -96,7 +96,11 @@ def factorized(
         )
     equation = Diffusion(boundary=() if boundary is None else boundary)
     is_traced = surface.is_traced or isinstance(screening, Tracer)
-    fixed = None if is_traced else what_is_fixed(equation, surface, jnp.zeros(surface.num_vertices, surface.dtype), 0.0)
+    fixed = (
+        None
+        if is_traced
+        else fixed_by_conditions(equation, surface, jnp.zeros(surface.num_vertices, surface.dtype), 0.0)
+    )
     if fixed is None:
         raise ValueError(
             "The matrix is factorised on the host, but the surface, the screening or the conditions are being traced "

@@ -1,7 +1,7 @@
-"""Whether two runs are the same (host).
+"""Fingerprints, by which two runs are compared (host).
 
-What enters: an equation, a start, options: any value that describes a run. What leaves: a short text that is equal for
-equal values, in this process and any other.
+What enters: any value that describes a run, such as an equation, an initial state or an option. What leaves: a short
+text that is the same for equal values in every process.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ import numpy as np
 
 
 def fingerprint(value: Any) -> str:
-    """A text of 16 digits that differs where the value does.
+    """A text of 16 hexadecimal digits that differs between different values.
 
-    Arrays count by their bytes, records and objects by their type and fields, functions by their source and by the
-    values that they have as defaults or from the functions around them. What a function reads from its module does not
-    count, nor do the methods of a class.
+    Arrays are compared by their bytes, records and objects by their type and fields, and functions by their source,
+    default values and closures. The values that a function reads from its module and the methods of a class are not
+    compared.
 
     Raises:
-        TypeError: the source of a function is not available, or an object has no fields to tell it by.
+        TypeError: the source of a function is not available, or the fields of an object cannot be read.
     """
     digest = hashlib.sha256()
     _feed(digest.update, value, [])
@@ -33,13 +33,13 @@ def fingerprint(value: Any) -> str:
 
 
 def read_from_modules(value: Any) -> dict[str, Any]:
-    """The values that the functions in a value read from the modules they are written in, by module and name.
+    """The values that the functions in a pytree read from their modules, by module and name.
 
-    Functions are looked for in pytrees, in closures, and among the values that other functions read. Those of
-    installed packages count as constant.
+    The functions are those in the pytree, in closures, and among the values that other functions read. Functions of
+    installed packages are left out.
 
     Args:
-        value: a pytree, or a function.
+        value: a pytree or a function.
     """
     values: dict[str, Any] = {}
     waiting, seen = list(jax.tree.leaves(value)), set()
@@ -61,7 +61,7 @@ def read_from_modules(value: Any) -> dict[str, Any]:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """The names that code and the functions within it may read from their module."""
+    """The names that a code object, and the functions inside it, may read from their module."""
     inner = [part for part in code.co_consts if isinstance(part, types.CodeType)]
     return set(code.co_names).union(*map(_names, inner))
 
@@ -75,9 +75,9 @@ def _feed(update: Callable[[bytes], None], value: Any, within: list[int]) -> Non
     """Feed a value into a digest.
 
     Args:
-        update: takes bytes.
+        update: function that takes bytes.
         value: the value.
-        within: the identities of the values that hold this one, from the outermost.
+        within: identities of the values that contain this one, from the outermost.
     """
 
     def put(text: str, *parts: Any) -> None:
@@ -88,7 +88,7 @@ def _feed(update: Callable[[bytes], None], value: Any, within: list[int]) -> Non
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = jax.random.key_data(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and _is_exact(value):
-        put(repr(float(value)))  # 1 and 1.0 are one length of steps
+        put(repr(float(value)))  # 1 and 1.0 are the same step length
     elif value is None or isinstance(value, bool | int | float | complex | str | bytes):
         put(repr(value))
     elif isinstance(value, np.ndarray | jax.Array | np.generic):
@@ -98,11 +98,11 @@ def _feed(update: Callable[[bytes], None], value: Any, within: list[int]) -> Non
             put("objects", *array.ravel().tolist())
         else:
             update(np.ascontiguousarray(array).tobytes())
-    elif isinstance(value, set | frozenset):  # in an order that is the same in every process
+    elif isinstance(value, set | frozenset):  # sorted, because their order differs between processes
         put("set", sorted(map(fingerprint, value)))
     elif isinstance(value, type | types.ModuleType | types.BuiltinFunctionType | np.ufunc):
         put(f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', value.__name__)}")
-    elif id(value) in within:  # a value that holds itself
+    elif id(value) in within:  # a value that contains itself
         put(f"the value {len(within) - within.index(id(value))} levels up")
     else:
         parts = _parts(value)
@@ -119,13 +119,13 @@ def _is_exact(number: int | float) -> bool:
 
 
 def _parts(value: Any) -> tuple[Any, ...]:
-    """A text and the parts that tell a value from others of its kind."""
+    """A text and the parts that distinguish a value from others of its kind."""
     if isinstance(value, tuple | list):
         return f"{len(value)} in order", *value
     if isinstance(value, Mapping):
         return f"{len(value)} by name", *((key, value[key]) for key in sorted(value, key=str))
     if isinstance(value, types.FunctionType):
-        # The checks of shapes that jaxtyping wraps around a function change no result.
+        # The shape checks that jaxtyping wraps around a function do not change its results.
         if "jaxtyping" in value.__code__.co_filename and hasattr(value, "__wrapped__"):
             return "checked", inspect.unwrap(value, stop=lambda inner: not _only_checks(inner))
         return _source(value), value.__defaults__, value.__kwdefaults__, _enclosed(value)
@@ -133,11 +133,11 @@ def _parts(value: Any) -> tuple[Any, ...]:
         return "method", value.__func__, value.__self__
     if isinstance(value, functools.partial):
         return "partial", value.func, value.args, value.keywords
-    if hasattr(value, "__wrapped__") and not hasattr(value, "__self__"):  # what jit makes of a function
+    if hasattr(value, "__wrapped__") and not hasattr(value, "__self__"):  # a jit-compiled function
         return "wrapped", type(value), value.__wrapped__
     try:
-        copied = value.__reduce_ex__(2)  # the fields of an object, as a copy of it would get them
-    except Exception:  # objects answer this question with any exception there is
+        copied = value.__reduce_ex__(2)  # the fields that a copy of the object would get
+    except Exception:  # objects may raise any exception
         raise TypeError(f"Objects of type {type(value).__name__} cannot be compared.") from None
     if isinstance(copied, str):
         return "object", type(value), copied
@@ -145,13 +145,13 @@ def _parts(value: Any) -> tuple[Any, ...]:
 
 
 def _only_checks(function: Any) -> bool:
-    """Whether a function is a wrapper of jaxtyping or beartype."""
+    """Whether a function is a wrapper made by jaxtyping or beartype."""
     file = getattr(getattr(function, "__code__", None), "co_filename", "")
     return "jaxtyping" in file or "beartype" in file
 
 
 def _enclosed(function: types.FunctionType) -> dict[str, Any]:
-    """The values that a function has from the functions around it, by name."""
+    """The values in a function's closure, by name."""
     values = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):  # not assigned yet
@@ -161,11 +161,11 @@ def _enclosed(function: types.FunctionType) -> dict[str, Any]:
 
 def _source(function: types.FunctionType) -> str:
     try:
-        if function.__code__.co_filename == "<string>":  # from exec, or from python -c, which later Pythons mix up
+        if function.__code__.co_filename == "<string>":  # exec or python -c, which newer Pythons confuse
             raise OSError
-        source = inspect.getsource(function.__code__)  # its own, not that of a function that it wraps
+        source = inspect.getsource(function.__code__)  # not the source of a function that it wraps
     except OSError:
         raise TypeError(f"The source of the function {function.__qualname__} is not available.") from None
-    # Several lambdas may share their lines: their columns tell them apart.
+    # Several lambdas may share a line, so their columns are included.
     columns = [column for place in function.__code__.co_positions() for column in place[2:] if column is not None]
     return f"{source}{min(columns, default=0)}-{max(columns, default=0)}"

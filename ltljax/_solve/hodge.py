@@ -18,8 +18,8 @@ from .._operators import check_vectors, curl, curvature, divergence, gradient, t
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .direct import Factorized
-from .elliptic import IncompatibleSourceWarning, poisson
 from .multigrid import Multigrid
+from .poisson import IncompatibleSourceWarning, poisson
 from .vector_heat import connection_matrix, lowest
 
 

@@ -1,13 +1,12 @@
 """Implicit and implicit-explicit steppers, whose stages are solved by preconditioned Krylov iteration.
 
-What enters: the stiff part of an equation, a tableau, and a `Preconditioning`. What leaves: diffrax solvers. diffrax
-has most of these methods itself, but solves their stages, and differentiates through them, with matrices of the size
-of the state.
+What enters: the stiff part of an equation, a tableau, and `StageSettings`. What leaves: diffrax solvers. diffrax has
+most of these methods itself, but its stages, and the derivatives through them, use matrices of the size of the state.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -20,152 +19,128 @@ from jaxtyping import Array
 
 from .._equations import Equation
 from .._surface import Surface
-from .krylov import BiCGStab, Jacobi, Preconditioner, linear_solve, rms, unit_of
-from .multigrid import Multigrid
+from .krylov import BiCGStab, Preconditioner, linear_solve, rms, unit_of
+from .preconditioning import LARGEST_RESIDUAL, StageSettings
 
-# Linear systems are solved to this share of the tolerance of a step, Newton's iterations to the share optimistix takes.
-_SHARE = 1e-2
-# And at least to this relative residual, which also bounds the error of derivatives.
-_LOOSEST = 1e-4
-# Absolute tolerances that are not given are this share of the relative one, times the size of a species.
-SHARE = 1e-2
 _MAX_NEWTON = 10
+# Corrections of Newton's method below this fraction of the tolerance are not solved for, because they are lost among
+# rounding errors.
+_NEWTON_SHARE = 1e-3
 
 
 class _Newton(optx.Newton):
     """Newton's method, which ends when the next correction would be a hundredth of the tolerance.
 
-    optimistix's own test, without its look at the residual, takes whatever has not converged in two steps for diverged.
+    optimistix's own test, without its check of the residual, treats an iteration that has not converged in two steps
+    as divergent.
     """
 
     rtol: Array | float  # type: ignore
     atol: Array | float  # type: ignore
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Whether the corrections are small enough, or the linear systems could not be solved."""
+        """Whether the corrections are small enough, or a linear system could not be solved."""
         del fn, y, args, options, tags
-        before = jnp.where(jnp.isfinite(state.diffsize_prev), state.diffsize_prev, 0)  # of the first there is none
+        before = jnp.where(jnp.isfinite(state.diffsize_prev), state.diffsize_prev, 0)  # infinite at first
         rate = jnp.minimum(state.diffsize / jnp.maximum(before, 1e-30), 1)
         has_converged = (state.step >= 1) & (state.diffsize * rate < self.kappa)
         return has_converged | (state.result != optx.RESULTS.successful), state.result
 
 
-class Preconditioning(eqx.Module):
-    """How stages are solved.
-
-    Without multigrid by Jacobi's method. Chebyshev polynomials in its place were measured and left out: on an icosphere
-    of 10,242 vertices they take down to a quarter of the time, but on random points, whose eigenvalues are off the real
-    axis, those of degree four take thousands of iterations, and milder ones (on a fifth of the interval) as long as
-    Jacobi's method.
+class Stage(NamedTuple):
+    """The equation ``scale y - factor rate(y) = b`` of a stage.
 
     Attributes:
-        multigrid: the hierarchy of the surface; None for Jacobi's method.
-        rtol: relative tolerance of a step.
-        atol: absolute tolerance of a step; None for a hundredth of ``rtol`` times the size of each species.
+        rate: ``y -> rate``.
+        is_affine: whether the rate is affine in y.
+        factor: coefficient of the rate.
+        b: right-hand side.
+        guess: initial guess of y.
+        scale: coefficient of y.
     """
 
-    multigrid: Multigrid | None = None
-    rtol: Array | float = 1e-4
-    atol: Array | float | None = None
-
-    def of(self, surface: Surface, alpha: Array, beta: Array) -> Preconditioner:
-        """An approximate inverse of ``alpha - beta Delta``, with one alpha and one beta for every species."""
-        if self.multigrid is not None:
-            return self.multigrid.shifted(alpha, beta)
-        return Jacobi(-surface.laplacian_stencil.diagonal()[:, None]).shifted(alpha, beta)
-
-    def absolute(self, unit: Array) -> Array:
-        """The absolute tolerance of each species, in units of their own."""
-        return jnp.broadcast_to(SHARE * self.rtol if self.atol is None else self.atol / unit, unit.shape)
-
-    def tolerance(self, u: Array, b: Array, absolute: Array) -> Array:
-        """Of a linear system for a state like u with right side b, relative to b."""
-        wanted = _SHARE * (jnp.sqrt(jnp.mean(absolute**2)) + self.rtol * rms(u))
-        least, size = 20 * jnp.finfo(u.dtype).eps, rms(b)
-        return jax.lax.stop_gradient(jnp.clip(wanted / jnp.where(size > 0, size, 1), least, _LOOSEST))
+    rate: Callable[[Array], Array]
+    is_affine: bool
+    factor: Any
+    b: Array
+    guess: Array
+    scale: Array | float = 1.0
 
 
-def implicit_stage(
-    equation: Equation,
-    rate: Callable[[Array], Array],
-    is_affine: bool,
-    surface: Surface,
-    factor: Any,
-    right: Array,
-    guess: Array,
-    preconditioning: Preconditioning,
-    scale: Array | float = 1.0,
-) -> tuple[Array, Array]:
-    """The y with ``scale y - factor rate(y) = right``, and whether it was found.
+def solve_stage(equation: Equation, surface: Surface, stage: Stage, settings: StageSettings) -> tuple[Array, Array]:
+    """The solution of a stage, and whether it converged.
 
-    One linear system where the rate is affine, else Newton's method; differentiable by the implicit function theorem.
+    One linear system if the rate is affine, else Newton's method. Differentiable by the implicit function theorem.
     """
-    # In units in which every species is of size one, or as large as the others where it vanishes.
-    size = jnp.maximum(equation.size(right), equation.size(guess))
+    # In these units each species has size one, or that of the largest species if it vanishes.
+    size = jnp.maximum(equation.size(stage.b), equation.size(stage.guess))
     unit = unit_of(jnp.where(size > 0, size, jnp.max(size)))[None]
-    y, found = _stage_in_units(
-        equation, lambda y: rate(y * unit) / unit, is_affine, surface, factor, right / unit, guess / unit,
-        preconditioning, preconditioning.absolute(unit), scale,
-    )  # fmt: skip
-    return y * unit, found
+    scaled = stage._replace(rate=lambda y: stage.rate(y * unit) / unit, b=stage.b / unit, guess=stage.guess / unit)
+    b = scaled.b
+    diffusivity = jnp.broadcast_to(equation.diffusivities(b), (b[0].size,)).astype(b.dtype)
+    alpha = jnp.broadcast_to(jnp.asarray(stage.scale, b.dtype), diffusivity.shape)
+    preconditioner = settings.preconditioner_of(surface, alpha, stage.factor * diffusivity)
+    solve = _solve_affine if stage.is_affine else _solve_by_newton
+    y, has_converged = solve(scaled, preconditioner, settings, settings.scaled_atol(unit))
+    return y * unit, has_converged
 
 
-def _stage_in_units(
-    equation, rate, is_affine, surface, factor, right, guess, preconditioning, absolute, scale
+def _solve_affine(
+    stage: Stage, preconditioner: Preconditioner, settings: StageSettings, atol: Array
 ) -> tuple[Array, Array]:
-    diffusivity = jnp.broadcast_to(equation.diffusivities(right), (right[0].size,)).astype(right.dtype)
-    alpha, beta = jnp.broadcast_to(jnp.asarray(scale, right.dtype), diffusivity.shape), factor * diffusivity
-    preconditioner = jax.lax.stop_gradient(preconditioning.of(surface, alpha, beta))
+    rate, _, factor, b, guess, scale = stage
+    value, derivative = jax.linearize(rate, guess)
+    defect = b - scale * guess + factor * value
+    rtol = settings.residual_tolerance(guess, defect, atol)
+    correction = linear_solve(lambda d: scale * d - factor * derivative(d), defect, preconditioner, rtol)
+    return guess + correction.value, correction.result == lx.RESULTS.successful
 
-    if is_affine:
-        value, derivative = jax.linearize(rate, guess)
-        defect = right - scale * guess + factor * value
-        tolerance = preconditioning.tolerance(guess, defect, absolute)
-        found = linear_solve(lambda d: scale * d - factor * derivative(d), defect, preconditioner, tolerance)
-        return guess + found.value, found.result == lx.RESULTS.successful
 
-    def defect_of(y, args):
-        rate, factor, right, scale = args
-        return scale * y - factor * rate(y) - right
+def _solve_by_newton(
+    stage: Stage, preconditioner: Preconditioner, settings: StageSettings, atol: Array
+) -> tuple[Array, Array]:
+    rate, _, factor, b, guess, scale = stage
 
-    # Closed over, what the rate depends on would be invisible to the derivative of the root.
+    def defect(y, args):
+        rate, factor, b, scale = args
+        return scale * y - factor * rate(y) - b
+
+    # The derivative of the root sees what the rate depends on only if it is passed in, not closed over.
     rate = eqx.filter_closure_convert(rate, guess)
-    # Corrections below what the tolerance can see are none, or the last would be solved for among rounding errors.
-    enough = 1e-3 * (jnp.sqrt(jnp.mean(absolute**2)) + preconditioning.rtol * rms(guess))
-    enough = jax.lax.stop_gradient(jnp.asarray(enough, right.dtype))
-    solver = BiCGStab(jnp.asarray(_LOOSEST, right.dtype), preconditioner, atol=enough)
+    smallest = _NEWTON_SHARE * (jnp.sqrt(jnp.mean(atol**2)) + settings.rtol * rms(guess))
+    smallest = jax.lax.stop_gradient(jnp.asarray(smallest, b.dtype))
     newton = _Newton(
-        jnp.asarray(preconditioning.rtol, right.dtype),
-        jax.lax.stop_gradient(jnp.asarray(absolute, right.dtype)),
+        jnp.asarray(settings.rtol, b.dtype),
+        jax.lax.stop_gradient(jnp.asarray(atol, b.dtype)),
         norm=optx.rms_norm,
-        linear_solver=solver,
+        linear_solver=BiCGStab(jnp.asarray(LARGEST_RESIDUAL, b.dtype), preconditioner, atol=smallest),
         cauchy_termination=False,
     )
-    exact = BiCGStab(1e-8 if right.dtype == jnp.float64 else 1e-5, preconditioner)
-    found = optx.root_find(
-        defect_of,
+    exact = BiCGStab(1e-8 if b.dtype == jnp.float64 else 1e-5, preconditioner)
+    root = optx.root_find(
+        defect,
         newton,
         guess,
-        (rate, factor, right, jnp.asarray(scale, right.dtype)),
+        (rate, factor, b, jnp.asarray(scale, b.dtype)),
         max_steps=_MAX_NEWTON,
         adjoint=optx.ImplicitAdjoint(exact),
         throw=False,
     )
-    return found.value, found.result == optx.RESULTS.successful
+    return root.value, root.result == optx.RESULTS.successful
 
 
-# Compared by identity, so that compiled code is found again.
+# Compared by identity, so that the compilation cache recognises it.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tableau:
-    """The coefficients of a diagonally implicit Runge-Kutta method, and of the explicit one beside it if there is one.
+    """The coefficients of a diagonally implicit Runge-Kutta method with s stages, or of an implicit-explicit pair.
 
     Attributes:
-        a: (s, s) of the implicit part, lower triangular with its diagonal.
-        b: (s,) of the step.
-        b_error: (s,) of the estimated error.
-        c: (s,) the times.
-        orders: in time, and of the estimated error.
-        explicit: a, b and b_error of the explicit part.
+        a: (s, s) coefficients of the implicit part, lower triangular with the diagonal.
+        b: (s,) weights of the step.
+        b_error: (s,) weights of the error estimate.
+        c: (s,) times of the stages.
+        orders: orders of the method and of the error estimate.
+        explicit: ``a``, ``b`` and ``b_error`` of the explicit part, if there is one.
     """
 
     a: np.ndarray
@@ -177,33 +152,33 @@ class Tableau:
 
 
 class ImplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
-    """A diagonally implicit Runge-Kutta method for the equations of ltljax, by itself or beside an explicit one.
+    """A diagonally implicit Runge-Kutta method for the equations of ltljax, or an implicit-explicit one.
 
-    With an explicit part the equation is split: what is stiff and affine (diffusion) is taken implicitly, the rest
-    (reactions, sources) explicitly; each stage is then one linear system. A step whose stages cannot be solved is
-    refused.
+    A method with an explicit part splits the equation: diffusion, which is stiff and affine, is taken implicitly, and
+    reactions and sources explicitly. Each stage is then one linear system. A step whose stages cannot be solved is
+    rejected.
 
     Attributes:
-        tableau: the method.
-        preconditioning: how stages are solved; `solve` fills it in.
+        tableau: coefficients of the method.
+        stages: how stages are solved; `solve` sets it.
     """
 
     tableau: Tableau = eqx.field(static=True)
-    preconditioning: Preconditioning = Preconditioning()
+    stages: StageSettings = StageSettings()
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
-        """The order in time."""
+        """The order of the method."""
         return self.tableau.orders[0]
 
     def error_order(self, terms):
-        """The order of the estimated error."""
+        """The order of the error estimate."""
         return self.tableau.orders[1]
 
     def init(self, terms, t0, t1, y0, args):
-        """Nothing is carried from step to step."""
+        """None: no state is carried from step to step."""
         del terms, t0, t1, y0, args
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -211,40 +186,38 @@ class ImplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         del terms, solver_state, made_jump
         equation, surface = args
         is_split = self.tableau.explicit is not None
-        dt, stages = t1 - t0, len(self.tableau.b)
+        dt, num_stages = t1 - t0, len(self.tableau.b)
         cast = lambda values: jnp.asarray(values, y0.dtype)  # noqa: E731
         a, b, b_error, c = map(cast, (self.tableau.a, self.tableau.b, self.tableau.b_error, self.tableau.c))
-        beside = tuple(map(cast, self.tableau.explicit or (0 * a, 0 * b, 0 * b)))
+        a_explicit, b_explicit, b_error_explicit = map(cast, self.tableau.explicit or (0 * a, 0 * b, 0 * b))
 
         def stiff(t, y):
             return equation.implicit_rate(t, surface, y) if is_split else equation.rate(t, surface, y)
 
-        def sum_of(weights, rates):
+        def weighted(weights, rates):
             return jnp.tensordot(weights, rates, axes=1)
 
         def stage(carry, i):
-            rates, mild, guess, fine = carry
+            rates, mild_rates, guess, is_good = carry
             t = t0 + c[i] * dt
-            right = y0 + dt * (sum_of(a[i], rates) + sum_of(beside[0][i], mild))
+            known = y0 + dt * (weighted(a[i], rates) + weighted(a_explicit[i], mild_rates))
             factor = dt * a[i, i]
-            y, found = implicit_stage(
-                equation, lambda y: stiff(t, y), is_split or equation.is_affine, surface, factor, right, guess,
-                self.preconditioning,
-            )  # fmt: skip
-            rates = rates.at[i].set((y - right) / factor)
-            mild = mild.at[i].set(equation.explicit_rate(t, surface, y)) if is_split else mild
-            return (rates, mild, y, fine & found), None
+            task = Stage(lambda y: stiff(t, y), is_split or equation.is_affine, factor, known, guess)
+            y, has_converged = solve_stage(equation, surface, task, self.stages)
+            rates = rates.at[i].set((y - known) / factor)
+            mild_rates = mild_rates.at[i].set(equation.explicit_rate(t, surface, y)) if is_split else mild_rates
+            return (rates, mild_rates, y, is_good & has_converged), None
 
-        empty = jnp.zeros((stages, *y0.shape), y0.dtype)
-        begins = int(self.tableau.a[0, 0] == 0)
-        rates = empty.at[0].set(stiff(t0, y0)) if begins else empty
-        mild = empty.at[0].set(equation.explicit_rate(t0, surface, y0)) if is_split else empty
-        carry = (rates, mild, y0, jnp.array(True))
-        (rates, mild, _, fine), _ = jax.lax.scan(stage, carry, jnp.arange(begins, stages))
-        y1 = y0 + dt * (sum_of(b, rates) + sum_of(beside[1], mild))
-        error = dt * (sum_of(b_error, rates) + sum_of(beside[2], mild))
-        # An adaptive controller refuses the step; without one the run stops at what is not a number.
-        y1, error = jnp.where(fine, y1, jnp.nan), jnp.where(fine, error, jnp.inf)
+        empty = jnp.zeros((num_stages, *y0.shape), y0.dtype)
+        num_explicit = int(self.tableau.a[0, 0] == 0)
+        rates = empty.at[0].set(stiff(t0, y0)) if num_explicit else empty
+        mild_rates = empty.at[0].set(equation.explicit_rate(t0, surface, y0)) if is_split else empty
+        carry = (rates, mild_rates, y0, jnp.array(True))
+        (rates, mild_rates, _, is_good), _ = jax.lax.scan(stage, carry, jnp.arange(num_explicit, num_stages))
+        y1 = y0 + dt * (weighted(b, rates) + weighted(b_explicit, mild_rates))
+        error = dt * (weighted(b_error, rates) + weighted(b_error_explicit, mild_rates))
+        # An adaptive controller rejects a step of infinite error; with fixed steps, the run ends at the NaN.
+        y1, error = jnp.where(is_good, y1, jnp.nan), jnp.where(is_good, error, jnp.inf)
         return y1, error, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):
@@ -271,7 +244,7 @@ _TRBDF2 = Tableau(
 
 
 class BackwardEuler(ImplicitRungeKutta):
-    """y1 = y0 + dt f(t1, y1): of first order, L-stable; with `Monotone` diffusion keeps the maximum principle.
+    """``y1 = y0 + dt f(t1, y1)``: first order and L-stable. Keeps the maximum principle with `Monotone` diffusion.
 
     The error is estimated by the difference from the trapezoidal rule.
     """
@@ -280,16 +253,16 @@ class BackwardEuler(ImplicitRungeKutta):
 
 
 class CrankNicolson(ImplicitRungeKutta):
-    """y1 = y0 + dt (f(t0, y0) + f(t1, y1)) / 2: of second order, A-stable but not L-stable.
+    """``y1 = y0 + dt (f(t0, y0) + f(t1, y1)) / 2``: second order, A-stable but not L-stable.
 
-    For fixed steps and smooth data. The error is estimated by the difference from backward Euler.
+    It suits fixed steps and smooth data. The error is estimated by the difference from backward Euler.
     """
 
     tableau: Tableau = eqx.field(static=True, default=_CRANK_NICOLSON)
 
 
 class TRBDF2(ImplicitRungeKutta):
-    """The trapezoidal rule for a part of the step, then the second backward difference: of second order, L-stable.
+    """The trapezoidal rule for part of a step, then the second backward difference: second order and L-stable.
 
     Source: Hosea and Shampine (1996), Analysis and implementation of TR-BDF2, doi:10.1016/0168-9274(95)00115-8.
     """
@@ -298,18 +271,19 @@ class TRBDF2(ImplicitRungeKutta):
 
 
 class SBDF2(diffrax.AbstractSolver):
-    """The second backward difference for what is stiff, extrapolation for the rest: of second order, one system a step.
+    """The second backward difference for diffusion and extrapolation for reactions and sources: second order.
 
-    For fixed steps. The first step is of first order, which costs no order over all.
+    Each step solves one linear system. Steps must be fixed. The first step has first order, which leaves the order of
+    the run at two.
 
     Attributes:
-        preconditioning: how systems are solved; `solve` fills it in.
+        stages: how linear systems are solved; `solve` sets it.
 
     Source: Ascher, Ruuth and Wetton (1995), Implicit-explicit methods for time-dependent partial differential
     equations, doi:10.1137/0732037; with steps of changing length Wang and Ruuth (2008), J. Comput. Math. 26.
     """
 
-    preconditioning: Preconditioning = Preconditioning()
+    stages: StageSettings = StageSettings()
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
@@ -319,7 +293,7 @@ class SBDF2(diffrax.AbstractSolver):
         return 2
 
     def init(self, terms, t0, t1, y0, args):
-        """The state before, the explicit rate there, and the length of the step from there: none yet."""
+        """The previous state, its explicit rate, and the length of the previous step: zero at first."""
         del terms, t1, args
         return y0, jnp.zeros_like(y0), jnp.zeros_like(t0)
 
@@ -329,20 +303,19 @@ class SBDF2(diffrax.AbstractSolver):
         equation, surface = args
         before, mild_before, dt_before = solver_state
         dt = t1 - t0
-        # The ratio of the steps; with zero in its place the formula is the backward-forward Euler of the first step.
+        # The ratio of the two steps. At zero, the formula is that of forward-backward Euler, for the first step.
         has_begun = dt_before > 0
         ratio = jnp.where(has_begun, dt / jnp.where(has_begun, dt_before, 1), 0)
         mild = equation.explicit_rate(t0, surface, y0)
-        right = (
+        known = (
             (1 + ratio) * y0
             - ratio**2 / (1 + ratio) * before
             + dt * ((1 + ratio) * mild - ratio * mild_before)
         )  # fmt: skip
-        y1, fine = implicit_stage(
-            equation, lambda y: equation.implicit_rate(t1, surface, y), True, surface, dt, right,
-            y0 + ratio * (y0 - before), self.preconditioning, (1 + 2 * ratio) / (1 + ratio),
-        )  # fmt: skip
-        y1 = jnp.where(fine, y1, jnp.nan)
+        guess, scale = y0 + ratio * (y0 - before), (1 + 2 * ratio) / (1 + ratio)
+        task = Stage(lambda y: equation.implicit_rate(t1, surface, y), True, dt, known, guess, scale)
+        y1, has_converged = solve_stage(equation, surface, task, self.stages)
+        y1 = jnp.where(has_converged, y1, jnp.nan)
         return y1, None, dict(y0=y0, y1=y1), (y0, mild, dt), diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):
@@ -351,7 +324,7 @@ class SBDF2(diffrax.AbstractSolver):
 
 
 def _square(tableau) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix and the times of one of diffrax's tableaus."""
+    """The matrix and the times of a tableau of diffrax."""
     size = len(tableau.b_sol)
     a = np.zeros((size, size))
     for row, values in enumerate(tableau.a_lower, start=1):
@@ -362,7 +335,7 @@ def _square(tableau) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _of_diffrax(solver: Any) -> Tableau:
-    """The method of one of diffrax's implicit solvers."""
+    """The tableau of an implicit solver of diffrax."""
     tableaus = getattr(solver.tableau, "tableaus", (solver.tableau,))
     implicit = tableaus[-1]
     a, c = _square(implicit)
@@ -381,7 +354,11 @@ _OF_DIFFRAX: dict[type, Tableau] = {
 
 
 def without_matrices(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
-    """The solver itself; in place of an implicit one of diffrax the same method with its stages solved as here."""
+    """The solver itself, or the matrix-free form of an implicit solver of diffrax.
+
+    Raises:
+        ValueError: the solver has no matrix-free form, or has settings that would be ignored.
+    """
     if isinstance(solver, diffrax.AbstractImplicitSolver):
         if type(solver) not in _OF_DIFFRAX:
             names = ", ".join(sorted(known.__name__ for known in _OF_DIFFRAX))
@@ -392,7 +369,8 @@ def without_matrices(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
         if not eqx.tree_equal(solver, type(solver)()):
             raise ValueError(
                 f"{type(solver).__name__} was given settings of its own, such as a root_finder, which would have no "
-                "effect: its stages are solved by Krylov iteration. Leave them out; rtol of ltl.solve says how well."
+                "effect: its stages are solved by Krylov iteration. Leave them out; the accuracy follows from the rtol "
+                "of ltl.solve."
             )
         return ImplicitRungeKutta(_OF_DIFFRAX[type(solver)])
     return solver

@@ -1,27 +1,23 @@
-"""Runs that survive: states on disk as a run goes, each whole or absent, and what a run must be to go on (host).
+"""Runs on disk: each state is either complete or absent, and only the same run may go on from it (host).
 
-What enters: a folder and a description of the run. What leaves: the states kept there so far.
+What enters: a folder and a description of the run. What leaves: the states that were kept there.
 """
 
 import dataclasses
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._base.folder import Folder
-from .._tables import AnyArray
-from .steps import without_twins
+from .fingerprint import fingerprint
 
 _RUN = "run.json"
-_ANEW = "Begin again in another folder."
-# The number of states that are always kept: the last one, and the one before it, from which it can be recomputed.
+_NEW_FOLDER = "Start again in another folder."
+# Number of states that are always kept: the last one, and the one from which it can be recomputed.
 _LAST = 2
 
 
@@ -29,29 +25,71 @@ class RestartError(ValueError):
     """The files of a folder belong to another run, or to one that has not ended, or are damaged."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Checkpoints:
+    """Where and how often a run is kept on disk, for ``ltl.solve(..., checkpoints=Checkpoints(folder))``.
+
+    The run is made interval by interval. Each interval begins with a first step and ends with its state put on disk, so
+    a run that is killed loses at most one interval. The last states and those at the requested times are kept. Not
+    inside jit.
+
+    Attributes:
+        folder: the folder; created if it does not exist.
+        every: length of the intervals in time, which also end at the requested times; by default a twentieth of the
+            run.
+        resume: whether to go on from the states in the folder, if they are those of the same call. The result is the
+            same as without the interruption. Two calls are the same if all arrays and options are, and if the functions
+            in ``equation``, ``solver`` and ``stop_when`` have the same source. The values that such a function reads
+            from its module, and the methods of a class, are not compared.
+        run_id: a name that stands for the equation, solver and ``stop_when`` when runs are compared. It is needed if
+            the source of a function is not available, or changes without changing what the function does.
+    """
+
+    folder: str | Path
+    every: float | None = None
+    resume: bool = False
+    run_id: str | None = None
+
+    def __post_init__(self):
+        if self.every is not None and not self.every > 0:
+            raise ValueError(f"Expected a positive length of intervals, found every = {self.every}.")
+
+    def fingerprint_of(self, value: Any) -> str:
+        """The fingerprint of a value that may contain functions, or of ``run_id`` if there is one.
+
+        Raises:
+            RestartError: the value cannot be compared.
+        """
+        try:
+            return fingerprint(value if self.run_id is None else self.run_id)
+        except TypeError as error:
+            raise RestartError(f"The run cannot be identified. {error} Name it with run_id=...") from None
+
+
 class Keeper:
     """The states of a run in a folder: the run's description, and one file for each state with its record.
 
-    Every file is either complete or absent, and is recorded as ltljax's own. A state that is not kept for good is
-    removed once two later ones exist, so that neither the folder nor what is written at a time grows with the
-    length of a run. A state that was damaged or changed is passed over, and stays.
+    Every file is either complete or absent, and is recorded as ltljax's own. A state that is not permanent is removed
+    once two later ones exist, so neither the folder nor a single write grows with the length of a run. A damaged or
+    changed state is skipped and left in place.
 
     Args:
-        folder: where; locked.
-        run: what the run is, as fingerprints by name; a run may only go on from files of the same.
-        resume: whether to go on from what is there; otherwise the states of a run that has ended are removed.
+        folder: the folder, locked.
+        run: fingerprints that identify the run, by name. Only a run with the same fingerprints goes on from its files.
+        resume: whether to go on from the states in the folder. Otherwise the states of a run that has ended are
+            removed.
         within: the part of the folder that holds the states.
-        overwrite: whether to remove the states of a run that has not ended, too.
-        ways: what can be done about a run that has not ended, as a sentence.
+        overwrite: whether to remove the states of a run that has not ended as well.
+        ways: a sentence that says what can be done about a run that has not ended.
 
     Attributes:
-        done: the records of the states that are kept, in order.
-        passed_over: the files of states that were damaged or changed.
+        done: records of the kept states, in order.
+        skipped: files of damaged or changed states.
 
     Raises:
-        RestartError: the files are those of another run, or damaged; or of a run that has not ended, and it is neither
-            to go on nor to be removed.
-        OutputError: files that ltljax has not written have the names of its own.
+        RestartError: the files are damaged or those of another run; or the run has not ended and is neither to be
+            resumed nor to be removed.
+        OutputError: files of other programs have the names of ltljax's own.
     """
 
     def __init__(
@@ -65,8 +103,8 @@ class Keeper:
     ):
         self.folder, self._run, self._within = folder, dict(run), f"{within}/" if within else ""
         self.done: list[dict[str, Any]] = []
-        self.passed_over: list[Path] = []
-        self._files: list[tuple[int, bool]] = []  # the number of each state, and whether it is kept for good
+        self.skipped: list[Path] = []
+        self._files: list[tuple[int, bool]] = []  # number of each state, and whether it is permanent
         description = self._within + _RUN
         if resume and (folder.path / description).exists():
             self._check(description)
@@ -74,65 +112,65 @@ class Keeper:
             return
         if resume and _states(folder, self._within):
             raise RestartError(
-                f"{folder.path / within} holds states, but not {_RUN}, which says what run made them. {_ANEW}"
+                f"{folder.path / within} holds states, but no {_RUN} that says which run made them. {_NEW_FOLDER}"
             )
         if not overwrite and (end := _unfinished(folder, self._within)) is not None:
             raise RestartError(f"{folder.path / within} holds a run that has not ended{end}. {ways}")
-        # All is known to be ltljax's own before anything is removed.
-        there = sorted((folder.path / within).glob("state_*.npz"))
-        folder.check([description, *(self._within + path.name for path in there)])
+        # All files are checked to be ltljax's own before any is removed.
+        states = sorted((folder.path / within).glob("state_*.npz"))
+        folder.check([description, *(self._within + path.name for path in states)])
         folder.remove([description, *_states(folder, self._within)])
         folder.write(description, json.dumps(dict(run=self._run, has_ended=False)).encode())
 
     def _check(self, description: str) -> None:
         path = self.folder.path / description
         if not self.folder.owns(description):
-            raise RestartError(f"{path} was damaged, changed, or not written by ltljax. {_ANEW}")
-        found = _description(self.folder, self._within)["run"]
-        differing = [name for name in self._run if found.get(name) != self._run[name]]
+            raise RestartError(f"{path} was damaged, changed, or not written by ltljax. {_NEW_FOLDER}")
+        earlier = _description(self.folder, self._within)["run"]
+        differing = [name for name in self._run if earlier.get(name) != self._run[name]]
         if differing:
             raise RestartError(
                 f"The files in {path.parent} belong to a run with another {', another '.join(differing)}. Repeat that "
-                "run as it was, or name another folder."
+                "run unchanged, or name another folder."
             )
 
     def _read(self) -> None:
         for path in sorted((self.folder.path / self._within).glob("state_*.npz")):
-            found = self._load(path)
-            if found is None or found["run"] != self._run:
-                self.passed_over.append(path)
+            content = self._load(path)
+            if content is None or content["run"] != self._run:
+                self.skipped.append(path)
                 continue
-            self.done.append(found["record"])
-            self._files.append((int(path.stem.removeprefix("state_")), found["for_good"]))
+            self.done.append(content["record"])
+            self._files.append((int(path.stem.removeprefix("state_")), content["for_good"]))
 
     def _load(self, path: Path) -> dict[str, Any] | None:
-        """What a state's file holds beside the state; None where it is not what was written."""
+        """What the file of a state holds besides the state; None if the file is not as it was written."""
         if not self.folder.owns(self._within + path.name):
             return None
         with np.load(path, allow_pickle=False) as arrays:
             return json.loads(arrays["record"].item())
 
     def state(self, index: int) -> np.ndarray:
-        """The state of one of the records.
+        """The state that belongs to a record.
 
         Raises:
-            RestartError: its file was damaged since.
+            RestartError: its file has been damaged since.
         """
         name = self._name(self._files[index][0])
         if not self.folder.owns(name):
-            raise RestartError(f"{self.folder.path / name} was damaged or removed while it was in use. {_ANEW}")
+            raise RestartError(f"{self.folder.path / name} was damaged or removed while it was in use. {_NEW_FOLDER}")
         with np.load(self.folder.path / name, allow_pickle=False) as arrays:
             return arrays["state"]
 
     def states(self) -> list[np.ndarray]:
-        """The states kept so far, in order."""
+        """The kept states, in order."""
         return [self.state(index) for index in range(len(self.done))]
 
     def keep(self, state: np.ndarray, record: dict[str, Any], *, for_good: bool = True) -> None:
-        """Put a state on disk with its record, for good or until two later ones are there."""
+        """Put a state on disk with its record, permanently or until two later states exist."""
         number = self._files[-1][0] + 1 if self._files else 0
         while (self.folder.path / self._name(number)).exists() and not self.folder.owns(self._name(number)):
-            number += 1  # what was passed over stays
+            number += 1  # skipped files stay
         text = np.asarray(json.dumps(dict(run=self._run, record=record, for_good=for_good)))
         content = io.BytesIO()
         np.savez(content, state=state, record=text)
@@ -146,21 +184,21 @@ class Keeper:
                 del self.done[index], self._files[index]
 
     def take_back(self) -> None:
-        """Forget the last state; its file stays until the next state overwrites it."""
+        """Forget the last state. Its file stays until the next state overwrites it."""
         self.done.pop()
         self._files.pop()
 
     def keep_first(self, count: int) -> None:
-        """Remove all states but the first ones, from which the rest are made again."""
+        """Remove all states but the first ``count``, from which the others are computed again."""
         self.folder.remove([self._name(number) for number, _ in self._files[count:]])
         del self.done[count:], self._files[count:]
 
     def end(self) -> None:
-        """Note that the run has ended: another one may take its place."""
+        """Record that the run has ended, so that another run may take its place."""
         self.folder.write(self._within + _RUN, json.dumps(dict(run=self._run, has_ended=True)).encode())
 
     def remove(self) -> None:
-        """Remove the states: the run has ended, and its results are elsewhere."""
+        """Remove the states and the description of a run whose results are stored elsewhere."""
         self.folder.remove([self._within + _RUN, *_states(self.folder, self._within)])
 
     def _name(self, number: int) -> str:
@@ -168,7 +206,7 @@ class Keeper:
 
 
 def _states(folder: Folder, within: str) -> list[str]:
-    """The names of the states in a part of a folder that are ltljax's own."""
+    """The names of ltljax's own state files in a part of a folder."""
     names = sorted((folder.path / within).glob("state_*.npz"))
     return [within + path.name for path in names if folder.owns(within + path.name)]
 
@@ -178,9 +216,9 @@ def _description(folder: Folder, within: str) -> dict[str, Any]:
 
 
 def _unfinished(folder: Folder, within: str) -> str | None:
-    """How far a run is that has states and has not ended, for a message; None if there is none.
+    """The progress of a run that has not ended, in words for a message; None if there is no such run.
 
-    States whose description is damaged or gone count as such a run.
+    States whose description is damaged or missing count as a run that has not ended.
     """
     states = _states(folder, within)
     if not states or (folder.owns(within + _RUN) and _description(folder, within)["has_ended"]):
@@ -188,80 +226,3 @@ def _unfinished(folder: Folder, within: str) -> str | None:
     with np.load(folder.path / states[-1], allow_pickle=False) as arrays:
         record = json.loads(arrays["record"].item())["record"]
     return f", at t = {record['t']:g}" if "t" in record else ""
-
-
-def in_intervals(
-    advance: Callable[..., Any],
-    keeper: Keeper,
-    u0: Array,
-    t0: float,
-    t1: float,
-    ts: AnyArray,
-    grid: np.ndarray | None,
-    every: float,
-) -> Any:
-    """The solution of a run that is made interval by interval, the state at the end of each being put on disk.
-
-    Kept for good, on disk and in memory, are the states at the times asked for.
-
-    Args:
-        advance: ``(u, begin, end, ts, grid) -> Solution``.
-        keeper: the folder, with the intervals that are done.
-        u0: the state at t0.
-        t0: the first time.
-        t1: the last time.
-        ts: the times asked for, at which intervals end too.
-        grid: the times of fixed steps, or None.
-        every: the length of an interval.
-    """
-    if t1 == t0:
-        return advance(u0, t0, t1, ts, None)
-    asked, slack = np.asarray(ts, np.float64), 1e-6 * every
-    multiples = t0 + every * np.arange(1, np.ceil((t1 - t0) / every))
-    ends = without_twins(t0, t1, (asked, multiples), slack)
-    if grid is not None:
-        # Intervals of whole steps.
-        steps = grid.astype(np.float64)
-        ends = np.unique(steps[np.minimum(np.searchsorted(steps, ends - slack), len(steps) - 1)])
-    places = np.abs(ends - asked[:, None]).argmin(axis=1)
-    if keeper.done and (keeper.done[-1]["interval"] == len(ends) - 1 or keeper.done[-1]["is_over"]):
-        # Nothing is left to do but to say how it ended: the last interval is repeated.
-        keeper.take_back()
-    # Where a state that was asked for is damaged or gone, the run goes on from before it.
-    there = {0, *(record["interval"] for record in keeper.done)}
-    absent = [place for place in places.tolist() if place not in there]
-    keeper.keep_first(sum(record["interval"] < min(absent, default=len(ends)) for record in keeper.done))
-    last: dict[str, Any] = keeper.done[-1] if keeper.done else dict(interval=0, counts={})
-    u = jnp.asarray(keeper.state(-1)) if keeper.done else u0
-    kept = {0: np.asarray(u0)} | {
-        record["interval"]: keeper.state(index)
-        for index, record in enumerate(keeper.done)
-        if record["interval"] in places
-    }
-    solution: Any = None
-    for interval in range(last["interval"] + 1, len(ends)):
-        begin, end = ends[interval - 1], ends[interval]
-        within = None if grid is None else grid[(grid >= begin) & (grid <= end)]
-        solution = advance(u, begin, end, np.asarray([end], ts.dtype), within)
-        u = solution.u_end
-        has_failed = bool(solution.result != diffrax.RESULTS.successful)
-        is_over = has_failed or bool(solution.overflowed | solution.stopped)
-        counts = {name: int(count) + last["counts"].get(name, 0) for name, count in solution.counts.items()}
-        last = dict(interval=interval, t=float(solution.t_end), is_over=is_over, counts=counts)
-        is_asked = interval in places
-        keeper.keep(np.asarray(u), last, for_good=is_asked)
-        if is_asked:
-            kept[interval] = np.asarray(u)
-        if is_over:
-            break
-    assert solution is not None  # the last interval is always advanced
-    keeper.end()
-    reached = (np.abs(ends[places] - asked) <= slack) & (ends[places] <= last["t"])
-    never = np.full(u0.shape, np.nan, u0.dtype)
-    us = [kept[place] if has else never for place, has in zip(places.tolist(), reached, strict=True)]
-    return dataclasses.replace(
-        solution,
-        ts=jnp.asarray(np.where(reached, asked, np.inf), ts.dtype),
-        us=jnp.asarray(np.stack(us)),
-        counts={name: jnp.asarray(count) for name, count in last["counts"].items()},
-    )

@@ -23,19 +23,20 @@ from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks
 from .direct import Factorized
-from .elliptic import (
+from .evolve import solve
+from .krylov import GMRES, Preconditioner, rms
+from .multigrid import Multigrid
+from .poisson import (
     INCOMPATIBLE,
     IncompatibleSourceWarning,
-    approximate_inverse,
     component_means,
     excess_mean,
     is_multiple_of_laplacian,
     raise_unless_converged,
     stationary_diffusion,
 )
-from .evolve import SolveError, Steady, solve
-from .krylov import GMRES, Preconditioner, rms
-from .multigrid import Multigrid
+from .preconditioning import preconditioner_for
+from .solution import SolveError, Steady
 
 _MAX_STEPS = 500
 _MAX_NEWTON = 5
@@ -110,7 +111,7 @@ def steady_state(
         raise ValueError(f"Expected a positive rtol and a positive t1, found {rtol} and {t1}.")
     if method not in ("newton", "marching"):
         raise ValueError(f'Expected the method "newton" or "marching", found {method!r}.')
-    inverse = approximate_inverse(equation, surface, u0, t) if preconditioner is None else preconditioner
+    inverse = preconditioner_for(equation, surface, u0, t) if preconditioner is None else preconditioner
     time = jnp.asarray(t, surface.dtype)
     start = u0
     if method == "marching":

@@ -18,7 +18,6 @@ import numpy as np
 
 from .._base.folder import Folder, OutputError, copies
 from .._base.progress import noted, watched
-from .._lifting.schemes import Monotone
 from .._mesh import Mesh
 from .._operators import integrate
 from .._solve import GrowingModesWarning, SolveError, solve
@@ -212,7 +211,7 @@ def _restore(progress: _Progress, keeper: Keeper) -> None:
     # The run continues from the frame before the first one whose state is damaged or missing.
     is_next = [record["frame"] == index for index, record in enumerate(keeper.done, start=1)]
     keeper.keep_first(is_next.index(False) if False in is_next else len(is_next))
-    for path in keeper.passed_over:
+    for path in keeper.skipped:
         print(f"note: {path} is damaged and is not used")
     for state, record in zip(keeper.states(), keeper.done, strict=True):
         progress.times.append(record["t"])
@@ -239,7 +238,7 @@ def _measure(scenario: Scenario, surface: Surface, progress: _Progress) -> dict[
         measured[f"maxima_of_{name}"] = count_maxima(scenario.mesh, values)
         measured[f"minima_of_{name}"] = count_maxima(scenario.mesh, -values)
     # Diffusion conserves the mass of Monotone() exactly, and the vertex areas up to the discretisation error.
-    measure = surface.mass if isinstance(surface.scheme, Monotone) else surface.vertex_areas
+    measure = surface.quadrature
     for name, state in (("start", first), ("end", last)):
         mass = integrate(surface, jnp.asarray(state, surface.dtype), measure)
         measured[f"mass_at_{name}"] = np.atleast_1d(np.asarray(mass)).tolist()

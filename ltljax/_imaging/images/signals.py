@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ..._base.arguments import as_numbers
-from ..._solve.evolve import SolveError
+from ..._solve.solution import SolveError
 from ..._surface import Surface
 from ..._tables import AnyArray
 

@@ -18,8 +18,8 @@ from ..._base.deprecated import renamed_arguments
 from ..._equations import Diffusion, Dirichlet
 from ..._operators import laplacian
 from ..._solve import Multigrid, SolveError
-from ..._solve.evolve import hierarchy
 from ..._solve.krylov import Jacobi, Preconditioner, linear_solve
+from ..._solve.preconditioning import multigrid_for
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .volume import check_volume, volumes, with_volumes
@@ -122,7 +122,7 @@ def fair(
     if preconditioner is None and order == 2:
         # Jacobi's method preconditions Delta^2 poorly where the size of a row differs much from its neighbours'.
         held = Dirichlet(0.0) if surface.topology.num_loops else ()
-        preconditioner = hierarchy(Diffusion(boundary=held), surface, surface.vertices[:, 0], 0.0)
+        preconditioner = multigrid_for(Diffusion(boundary=held), surface, surface.vertices[:, 0], 0.0)
     vertices, is_solved = _faired(surface, jnp.asarray(strength, surface.dtype), order, keep_volume, preconditioner)
     if throw and not isinstance(is_solved, Tracer) and not bool(is_solved):
         raise SolveError(

@@ -14,19 +14,20 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._base.deprecated import renamed_arguments
-from .._equations import Diffusion, Equation, boundary as bounds
+from .._equations import Diffusion, boundary as bounds
 from .._equations.spreads import are_numbers
 from .._lifting.schemes import Monotone, Paper, Polynomial
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks
 from .direct import Factorized, factor
-from .evolve import SolveError, hierarchy, what_is_fixed
 from .krylov import Jacobi, Preconditioner, linear_solve, rms, unit_of
 from .multigrid import Multigrid
+from .preconditioning import fixed_by_conditions, preconditioner_for
+from .solution import SolveError
 
 # A right-hand side whose mean exceeds this share of its root mean square is reported as incompatible.
 INCOMPATIBLE = 1e-2
@@ -168,19 +169,13 @@ def _inverse(equation: Diffusion, surface: Surface, f: Array, screening: Any) ->
     is_small = surface.num_vertices <= _FACTORISED[type(surface.scheme)] and jax.default_backend() == "cpu"
     fixed = None
     if is_small and not surface.is_traced and not isinstance(screening, Tracer):
-        fixed = what_is_fixed(equation, surface, f, 0.0)
+        fixed = fixed_by_conditions(equation, surface, f, 0.0)
     if fixed is not None:
         absorption, is_held = fixed
         # Iteration may still solve a singular system.
         with contextlib.suppress(RuntimeError):
             return factor(surface, np.asarray(screening, np.float64) + absorption, is_held)
-    return approximate_inverse(equation, surface, f, 0.0)
-
-
-def approximate_inverse(equation: Equation, surface: Surface, u: Array, time: ArrayLike) -> Preconditioner:
-    """Multigrid where it is available, else Jacobi's method."""
-    multigrid = hierarchy(equation, surface, u, time)
-    return Jacobi(-surface.laplacian_stencil.diagonal()[:, None]) if multigrid is None else multigrid
+    return preconditioner_for(equation, surface, f, 0.0)
 
 
 class LinearState(NamedTuple):
