@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 _PACKAGE = __name__.partition(".")[0]
-_VERSION = 1
+_VERSION = 2
 
 
 def write_record(path: Path, record: Any) -> None:
