@@ -17,8 +17,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir(
 os.environ.setdefault("EQX_ON_ERROR", "nan")
 
 if os.environ.get("LTLJAX_CHECK_SHAPES") == "1":
-    with install_import_hook("ltljax", "beartype.beartype"):
-        import ltljax  # noqa: F401  (the first import, so that the hook applies)
+    # The hook stays in place, since the package imports its modules when they are first used.
+    install_import_hook("ltljax", "beartype.beartype")
 
 import jax
 import jaxtyping
