@@ -4,7 +4,7 @@ from ._base.folder import OutputError
 from ._fit import FitError
 from ._mesh import MeshError
 from ._solve.evolve import GrowingModesWarning
-from ._solve.poisson import IncompatibleSourceWarning
+from ._solve.poisson_equation import IncompatibleSourceWarning
 from ._solve.restart import RestartError
 from ._solve.solution import SolveError
 from ._surface import CoarseMeshWarning, FarFromOriginWarning, InconsistentRowsWarning

@@ -64,7 +64,7 @@ FAMILIES = {
     "explicit": (diffrax.Heun(), 0.01), "RKL2": (ltl.RKL2(), 0.05), "SBDF2": (ltl.SBDF2(), 0.05),
     "TRBDF2": (ltl.TRBDF2(), 0.1), "stationary": (None, None),
 }  # fmt: skip
-SLOW_FAMILIES = {"explicit", "SBDF2", "TRBDF2"}
+SLOW_FAMILIES = {"explicit", "RKL2", "SBDF2", "TRBDF2"}
 
 
 @pytest.mark.parametrize(

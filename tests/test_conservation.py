@@ -68,7 +68,7 @@ def test_mass_is_computed_once_and_refused_inside_jit():
     assert surface.mass is surface.mass
     moved = surface.with_vertices(surface.vertices * jnp.asarray([[1.0, 1.0, 1.1]]))
     assert not np.allclose(moved.mass, surface.mass, rtol=1e-3)
-    with pytest.raises(ValueError, match=r"being traced.*hand it in"):
+    with pytest.raises(ValueError, match=r"being traced.*pass it"):
         jax.jit(lambda s: s.mass)(surface)
 
 

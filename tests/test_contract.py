@@ -98,7 +98,7 @@ def dented_sphere():
     return ltl.Mesh(sphere.vertices + 0.05 * np.random.default_rng(0).normal(size=sphere.vertices.shape), sphere.faces)
 
 
-@pytest.mark.parametrize("make", [dented_sphere, bent_disk])
+@pytest.mark.parametrize("make", [dented_sphere, pytest.param(bent_disk, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["paper", "monotone", pytest.param("polynomial", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")
 def test_derivatives_of_gradient_and_laplacian_in_the_vertices(make, name):

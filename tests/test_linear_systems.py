@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 
 import ltljax as ltl
 from ltljax._base import cache
-from ltljax._solve import direct, elliptic, preconditioning
+from ltljax._solve import direct, poisson_equation, preconditioning
 from ltljax._solve.krylov import GMRES, BiCGStab, BiCGStabThenGMRES, Jacobi, linear_solve
 
 MESHES = {
@@ -134,7 +134,7 @@ def inverse_kind(request, monkeypatch):
 
 def choose_inverse(kind, monkeypatch):
     if kind == "multigrid":
-        monkeypatch.setattr(elliptic, "_FACTORISED", dict.fromkeys(elliptic._FACTORISED, 0))
+        monkeypatch.setattr(elliptic, "_FACTORISED", dict.fromkeys(poisson_equation._FACTORISED, 0))
     return kind
 
 
@@ -142,7 +142,7 @@ def choose_inverse(kind, monkeypatch):
 def counts(monkeypatch):
     """The numbers of iterations of the Poisson equations solved so far."""
     numbers = []
-    solve = elliptic.stationary_diffusion
+    solve = poisson_equation.stationary_diffusion
 
     def counting_solve(*args):
         state = solve(*args)
@@ -371,10 +371,10 @@ def test_factors_of_one_size_share_a_program_and_are_released_with_their_surface
     f = surface.vertices[:, 0]
     ltl.screened_poisson(surface, f, 1.0)
     gc.collect()
-    num_handles, num_programs = len(cache._handles), elliptic.stationary_diffusion._cached._cache_size()
+    num_handles, num_programs = len(cache._handles), poisson_equation.stationary_diffusion._cached._cache_size()
     for screening in np.linspace(1.1, 2.0, 10):
         ltl.screened_poisson(surface, f, screening)
-    assert elliptic.stationary_diffusion._cached._cache_size() == num_programs
+    assert poisson_equation.stationary_diffusion._cached._cache_size() == num_programs
     gc.collect()
     assert len(cache._handles) == num_handles + direct._CACHED - 1
     del surface, f
@@ -394,7 +394,7 @@ def test_one_factor_serves_all_data_of_a_robin_condition():
 
 def test_poisson_uses_a_factor_or_multigrid_inside_jit_as_well(small_sphere, inverse_kind, monkeypatch):
     kinds = []
-    solve = elliptic.stationary_diffusion
+    solve = poisson_equation.stationary_diffusion
     monkeypatch.setattr(elliptic, "stationary_diffusion", lambda *args: kinds.append(type(args[5])) or solve(*args))
     f = jnp.sin(3 * small_sphere.vertices[:, 0])
     batch = jax.jit(jax.vmap(lambda f: ltl.screened_poisson(small_sphere, f, 1.0)))(jnp.stack([f, 2 * f]))
@@ -411,9 +411,9 @@ def test_without_multigrid_poisson_falls_back_to_jacobi(small_sphere, monkeypatc
     monkeypatch.setattr(preconditioning, "is_available", lambda: False)
     np.testing.assert_allclose(ltl.screened_poisson(small_sphere, f, 1.0), exact, atol=1e-9)
     zero = jnp.zeros(())
-    failed = elliptic.LinearState(f, zero, zero, jnp.array(False), jnp.array(20_000))
+    failed = poisson_equation.LinearState(f, zero, zero, jnp.array(False), jnp.array(20_000))
     with pytest.raises(ltl.SolveError, match=r'within 20000 iterations\. Install the extra "amg"'):
-        elliptic.raise_unless_converged(failed, Jacobi(jnp.ones((1, 1))))
+        poisson_equation.raise_unless_converged(failed, Jacobi(jnp.ones((1, 1))))
 
 
 def test_a_singular_system_is_refused():

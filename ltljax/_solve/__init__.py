@@ -8,7 +8,7 @@ from .hodge import HarmonicFields, HodgeParts, harmonic_fields, helmholtz_hodge
 from .implicit import SBDF2, TRBDF2, BackwardEuler, CrankNicolson
 from .modes import Eigenmodes, eigenmodes
 from .multigrid import Multigrid, multigrid
-from .poisson import IncompatibleSourceWarning, poisson, screened_poisson
+from .poisson_equation import IncompatibleSourceWarning, poisson, screened_poisson
 from .restart import Checkpoints, RestartError
 from .solution import Solution, SolveError, Steady
 from .stabilised import RKL1, RKL2

@@ -19,7 +19,7 @@ from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from .direct import Factorized
 from .multigrid import Multigrid
-from .poisson import IncompatibleSourceWarning, poisson
+from .poisson_equation import IncompatibleSourceWarning, poisson
 from .vector_heat import connection_matrix, lowest
 
 

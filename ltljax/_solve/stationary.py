@@ -26,7 +26,7 @@ from .direct import Factorized
 from .evolve import solve
 from .krylov import GMRES, Preconditioner, rms
 from .multigrid import Multigrid
-from .poisson import (
+from .poisson_equation import (
     INCOMPATIBLE,
     IncompatibleSourceWarning,
     component_means,

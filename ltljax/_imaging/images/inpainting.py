@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..._equations import Dirichlet
 from ..._operators import laplacian
 from ..._solve.direct import Factorized, factorized
-from ..._solve.poisson import poisson
+from ..._solve.poisson_equation import poisson
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
 from .conjugate_gradients import SplitPreconditioner, conjugate_gradients
