@@ -11,6 +11,7 @@ equations are made of operators; `solve` integrates them in time.
 """
 
 import importlib
+import sys
 from typing import Any
 
 import lazy_loader
@@ -47,7 +48,9 @@ def __getattr__(name: str) -> Any:
         home = f"ltljax.{_NEW_HOME[name]}"
         warn_deprecated(f"ltljax.{name}", f"{home}.{name}")
         return getattr(importlib.import_module(home), name)
-    return _load(name)
+    if name in __all__:
+        return _load(name)
+    raise AttributeError(f"module 'ltljax' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:

@@ -84,9 +84,14 @@ class Stencil(eqx.Module):
     def with_conductivity(self, g: Float[AnyArray, " V"], mean: Mean) -> "Stencil":
         """The operator with each weight multiplied by a mean of g at the vertex and at the neighbour.
 
-        Of a Laplacian this gives ``div(g grad u)``. The harmonic mean is ``2 a b / (a + b)``, and zero where a or b is
+        For a Laplacian this is ``div(g grad u)``. The harmonic mean is ``2 a b / (a + b)``, and zero where a or b is
         not positive.
+
+        Raises:
+            ValueError: the stencil has a centre, which no conductivity between vertices belongs to.
         """
+        if self.centre is not None:
+            raise ValueError("Expected a stencil of differences only, found one with a weight of the vertex itself.")
         rises = differences(self.table, g)
         if mean == "harmonic":
             means = self.table.each(lambda block, rise: _harmonic(block.centre(g)[None], rise), rises)
