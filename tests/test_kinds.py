@@ -72,7 +72,7 @@ def test_errors_of_solve_say_what_was_expected(surface, change, message):
         (lambda s: ltl.poisson(None, s.vertices[:, 0]), "poisson expected a Surface as surface, found None"),
         (lambda s: ltl.poisson(s, lambda x: x), "as real numbers, found a function"),
         (lambda s: ltl.eigenmodes(s, 3.5), "Expected a whole number of modes, found 3.5"),
-        (lambda s: ltl.geodesic_distance(s, 0.5), "Expected the numbers of source vertices"),
+        (lambda s: ltl.geodesic_distance(s, 0.5), "Expected the indices of source vertices"),
         (lambda s: ltl.load_mesh(MESH), "Expected the path of a file, found a Mesh. It needs no loading"),
         (lambda s: ltl.load_mesh(None), "Expected the path of a file, found a NoneType"),
     ],
