@@ -1,6 +1,6 @@
 """The exceptions and warnings of ltljax, to catch or filter by name."""
 
-from ._base.folder import OutputError
+from ._base.owned_folder import OutputError
 from ._fit import FitError
 from ._mesh import MeshError
 from ._solve.evolve import GrowingModesWarning

@@ -21,7 +21,7 @@ from ._imaging.images.inpainting import inpaint
 from ._imaging.images.quality import mse, psnr, ssim
 from ._imaging.images.segmentation import Segmentation, segment
 from ._imaging.images.textures import from_texture, project_image, to_texture
-from ._imaging.images.variation import denoise, noise_strength
+from ._imaging.images.total_variation import denoise, noise_strength
 from ._imaging.shapes.fairing import fair, mean_curvature_flow
 from ._imaging.shapes.normal_filter import denoise_mesh as denoise_mesh, filter_normals
 from ._imaging.shapes.relief import Ridges, ridges, shape_index

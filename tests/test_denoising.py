@@ -10,7 +10,7 @@ import ltljax as ltl
 from ltljax import imaging
 from ltljax._imaging.images import minimiser
 from ltljax._imaging.images.minimiser import Functional, HatGradients
-from ltljax._imaging.images.variation import flatness
+from ltljax._imaging.images.total_variation import flatness
 
 # Two vertices of Spot have inconsistent rows.
 pytestmark = pytest.mark.filterwarnings("ignore::ltljax.errors.InconsistentRowsWarning")

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from ltljax._base import folder as folder_module
-from ltljax._base.folder import Folder, OutputError, copies
+from ltljax._base import owned_folder as folder_module
+from ltljax._base.owned_folder import Folder, OutputError, copies
 
 
 def written(path, **contents):
@@ -107,7 +107,7 @@ def test_a_draft_outside_the_folder_is_rejected(tmp_path):
 
 def test_one_program_writes_at_a_time_and_a_killed_program_releases_its_lock(tmp_path):
     code = (
-        "import sys; from ltljax._base.folder import Folder\n"
+        "import sys; from ltljax._base.owned_folder import Folder\n"
         "with Folder(sys.argv[1]).locked() as folder, folder.draft() as draft:\n"
         "    (draft / 'half').write_text('x'); print('locked', flush=True); sys.stdin.read()"
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax._base.folder import OutputError
+from ltljax._base.owned_folder import OutputError
 from ltljax._output import files
 from ltljax.app.cli import main
 

@@ -40,7 +40,7 @@ DOES_WITHOUT = {
 MAY_IMPORT = {room: set(ROOMS[:place]) - DOES_WITHOUT.get(room, set()) for place, room in enumerate(ROOMS)}
 MAY_IMPORT |= {name: set(ROOMS) for name in PUBLIC}
 MAY_IMPORT["app"] = {*ROOMS, *PUBLIC}
-# These compute on the host, and do without JAX.
+# These compute on the host, and do not import JAX themselves. What they import from other rooms may import it.
 NO_JAX = [
     "_mesh",
     "_output",

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import ltljax as ltl
-from ltljax._base.folder import Folder
+from ltljax._base.owned_folder import Folder
 from ltljax._solve.fingerprint import fingerprint
 from ltljax.app import scenario
 from ltljax.solvers import Checkpoints

@@ -62,7 +62,7 @@ BROKEN = {
     "unknown solver": (PLAIN + '[solver]\nname = "Magic"\n', "solver.name"),
     "solver without its step": (PLAIN + '[solver]\nname = "SBDF2"\n', "solver.dt"),
     "unknown species shown": (PLAIN + '[output]\nshow = "w"\n', "output.show"),
-    "two reactions": (PLAIN + '[reactions]\ndu = "1"\n', "not both"),
+    "two reactions": (PLAIN + '[reactions]\ndu = "1"\n', "There are both"),
     "short direction": (PLAIN + '[direction]\nfield = ["1", "2"]\n', "a list of 3 formulas"),
     "direction of no species": (PLAIN + '[direction]\nfield = [1, 0, 0]\nspecies = ["w"]\n', "direction.species"),
     "deep tables": ("x = " + "[" * 5000 + "]" * 5000 + PLAIN, "expected"),
@@ -82,7 +82,8 @@ BROKEN = {
     ),
     "too many species": (
         changed(REACTION, "[reactions]\n")
-        .replace("[reactions]\n", "[reactions]\n" + "".join(f"ds{k} = 0\n" for k in range(100))), "at most 64 species",
+        .replace("[reactions]\n", "[reactions]\n" + "".join(f"ds{k} = 0\n" for k in range(100))),
+        "more than 64 species",
     ),
     "state of nothing": (changed(START, 'file = "empty.npz"'), "a CSV or .npz file"),
     "state cut short": (changed(START, 'file = "cut.npz"'), "a CSV or .npz file"),

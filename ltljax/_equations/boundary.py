@@ -2,7 +2,8 @@
 
 What enters: conditions, the time and the state. What leaves: boundary fluxes, and the state with the values that
 conditions hold. Where no condition applies the normal derivative vanishes. If two conditions apply to the same vertex,
-the later one wins.
+the later one wins. A condition changes a flux or a value at its own vertices; anything that joins vertices (such as
+periodic boundaries) belongs to the mesh.
 """
 
 import functools

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._base.folder import Folder
+from .._base.owned_folder import Folder
 from .._solve.fingerprint import fingerprint
 from .._solve.restart import RestartError
 from .observations import Observations

@@ -128,13 +128,13 @@ class _Beginning:
 
     Attributes:
         z: first unknowns.
-        function: function that the solver sees.
-        program: residuals inside ``function``.
+        objective: scaled objective, as the solver calls it.
+        program: residuals inside ``objective``.
         scanned: sentence about the scan for a better start; empty if there was none.
     """
 
     z: Array
-    function: Any
+    objective: Any
     program: Program
     scanned: str
 
@@ -148,20 +148,20 @@ def _begin(problem: Problem, z: Array, interrupted: Interrupted | None, scan: bo
     program, scanned = problem.program, ""
     if interrupted is not None:
         program = program.with_spread(jnp.asarray(interrupted.spread, z.dtype))
-    function, (value, misfit) = problem.function(program, z)
+    objective, (value, misfit) = problem.objective(program, z)
     if scan and interrupted is None and explains_nothing(problem.residuals, np.asarray(misfit)):
         z, scanned = _scan(problem.residuals, z)
-        function, (value, misfit) = problem.function(program, z)
+        objective, (value, misfit) = problem.objective(program, z)
     # Infinite derivatives make the scale zero.
-    if not 0 < float(function.scale) < np.inf and bool(jnp.isfinite(value).all()):
+    if not 0 < float(objective.scale) < np.inf and bool(jnp.isfinite(value).all()):
         raise FitError(
             "The model has no finite derivatives at the start, though its prediction is finite. Look for a square "
             "root, a norm or a power of zero there, or choose another start."
         )
     if interrupted is None and problem.data.has_moving_spread:
         program, _ = _respread(problem.data, program, misfit)
-        function = dataclasses.replace(function, residuals=program)
-    return _Beginning(z, function, program, scanned)
+        objective = dataclasses.replace(objective, residuals=program)
+    return _Beginning(z, objective, program, scanned)
 
 
 def _search_in_rounds(
@@ -184,7 +184,7 @@ def _search_in_rounds(
         after: ``(iteration, loss, z, spread) -> bool``, called after each iteration; True ends the search.
     """
     data, z = problem.data, beginning.z
-    function, program = beginning.function, beginning.program
+    objective, program = beginning.objective, beginning.program
     losses: list[float] = []
     end = End(z, losses, "", False)
 
@@ -195,7 +195,8 @@ def _search_in_rounds(
         num_before, spread = len(losses), program.arrays.spread
         iterations = range(max_iterations - num_before)
         end = search(
-            problem.solver, function, z, watched("fit", unit="iteration")(iterations) if progress else iterations, unit,
+            problem.solver, objective, z,
+            watched("fit", unit="iteration")(iterations) if progress else iterations, unit,
             lambda k, loss, z, num_before=num_before, spread=spread: after(num_before + k, loss, z, spread),
         )  # fmt: skip
         z, losses = end.z, losses + end.losses
@@ -209,7 +210,7 @@ def _search_in_rounds(
             end = dataclasses.replace(end, has_settled=False, reason=reason if end.has_settled else end.reason)
             break
         program = changed
-        function = dataclasses.replace(function, residuals=program)
+        objective = dataclasses.replace(objective, residuals=program)
     return program, dataclasses.replace(end, losses=losses)
 
 

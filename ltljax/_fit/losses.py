@@ -24,10 +24,12 @@ def _linear(z: Array) -> Array:
 
 
 def _huber(z: Array) -> Array:
+    # rho(z) = z for z <= 1, otherwise 2 sqrt(z) - 1: quadratic in the residual at first, then linear.
     return jnp.where(z <= 1, z, 2 * jnp.sqrt(jnp.maximum(z, 1)) - 1)
 
 
 def _soft_l1(z: Array) -> Array:
+    # rho(z) = 2 (sqrt(1 + z) - 1), in a form that keeps its digits for small z.
     return 2 * z / (1 + jnp.sqrt(1 + z))
 
 

@@ -107,9 +107,9 @@ def _fit_one(problem: Problem, z: Array, data_set: tuple[Array, Array] | None, m
     residuals = problem.program
     if data_set is not None:
         residuals = eqx.tree_at(lambda r: (r.arrays.data.values, r.arrays.data.mask), residuals, data_set)
-    function, _ = problem.function(residuals, z)
+    objective, _ = problem.objective(residuals, z)
     minimise = optx.least_squares if problem.is_least_squares else optx.minimise
-    solution = minimise(function, problem.solver, z, has_aux=True, throw=False, max_steps=max_iterations)
+    solution = minimise(objective, problem.solver, z, has_aux=True, throw=False, max_steps=max_iterations)
     loss = 0.5 * jnp.sum(residuals(solution.value) ** 2)
     converged = (solution.result == optx.RESULTS.successful) & jnp.isfinite(loss)
     params, calibration = problem.space.values(solution.value)

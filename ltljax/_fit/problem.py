@@ -59,9 +59,11 @@ class FitResiduals(eqx.Module):
             return self.model(params, self.data.times, self.adjoint)
         return self.model(params) if self.adjoint is None else self.model(params, adjoint=self.adjoint)
 
-    def both(self, z: Array) -> tuple[Array, Array]:
-        """Residuals (M + P,), half of whose sum of squares is the loss, all infinite if the model fails; and the misfit
-        (M,)."""
+    def residuals_and_misfit(self, z: Array) -> tuple[Array, Array]:
+        """Residuals (M + P,) and misfit (M,).
+
+        The loss is half the sum of squared residuals. If the model fails, all residuals are infinite.
+        """
         misfit = self.data.misfit(self.predicted(z), self.space.calibration(z), self.spread)
         residuals = self.data.loss.root(misfit)
         if self.penalty is not None:
@@ -71,7 +73,7 @@ class FitResiduals(eqx.Module):
 
     def __call__(self, z: Array) -> Array:
         """The residuals."""
-        return self.both(z)[0]
+        return self.residuals_and_misfit(z)[0]
 
 
 class Program(eqx.Module):
@@ -85,13 +87,13 @@ class Program(eqx.Module):
     run: Callable[[Any, Array], tuple[Array, Array]]
     arrays: Any
 
-    def both(self, z: Array) -> tuple[Array, Array]:
+    def residuals_and_misfit(self, z: Array) -> tuple[Array, Array]:
         """Residuals and misfit, as of `FitResiduals`."""
         return self.run(self.arrays, z)
 
     def __call__(self, z: Array) -> Array:
         """The residuals."""
-        return self.both(z)[0]
+        return self.residuals_and_misfit(z)[0]
 
     @property
     def num_unknowns(self) -> int:
@@ -109,9 +111,9 @@ AnyResiduals = FitResiduals | Program
 def _jacobian(residuals: AnyResiduals, z: Array, reverse: bool) -> tuple[tuple[Array, Array], Array]:
     """Residuals and misfit, and the Jacobian (M + P, n) of the residuals, from one run of the model."""
     if reverse:
-        value, pull, misfit = jax.vjp(residuals.both, z, has_aux=True)
+        value, pull, misfit = jax.vjp(residuals.residuals_and_misfit, z, has_aux=True)
         return (value, misfit), jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size, dtype=value.dtype))
-    push = lambda column: jax.jvp(residuals.both, (z,), (column,), has_aux=True)  # noqa: E731
+    push = lambda column: jax.jvp(residuals.residuals_and_misfit, (z,), (column,), has_aux=True)  # noqa: E731
     value, jacobian, misfit = jax.vmap(push, out_axes=(None, -1, None))(jnp.eye(z.size, dtype=z.dtype))
     return (value, misfit), jacobian
 
@@ -191,9 +193,8 @@ class Problem(eqx.Module):
         """Whether the method uses the residuals, and not only the loss."""
         return isinstance(self.solver, optx.AbstractLeastSquaresSolver)
 
-    def function(self, residuals: AnyResiduals, z: Array) -> tuple[Any, tuple[Array, Array]]:
-        """The function that the solver minimises, scaled so that an initial damping of 1 suits it; residuals and misfit
-        at ``z``."""
+    def objective(self, residuals: AnyResiduals, z: Array) -> tuple[Any, tuple[Array, Array]]:
+        """The scaled objective, and residuals and misfit at ``z``. The scale makes an initial damping of 1 suitable."""
         if not self.is_least_squares:
             # With this scale, the first step along the gradient has length 1.
             slope, values = _gradient(residuals, z)
@@ -203,21 +204,21 @@ class Problem(eqx.Module):
         return _LeastSquares(residuals, scale, self.reverse), values
 
     def profile(self, residuals: Program, z0: Array, name: str, values: np.ndarray, max_iterations: int) -> np.ndarray:
-        """(P,) least losses with one parameter held at each of some values."""
+        """The smallest loss (N,) for each given value of one parameter."""
         if name not in self.space.names:
             raise ValueError(f"There is no parameter {name!r}; there are {', '.join(self.space.names)}.")
         if not self.is_least_squares:
             raise ValueError("Profiles need a least-squares method: ltl.fit(..., method=optx.LevenbergMarquardt(...)).")
         index = self.space.names.index(name)
         flat, rebuild = ravel_pytree(self.space.values(z0))
-        scale, solver = self.function(residuals, z0)[0].scale, self.solver
+        scale, solver = self.objective(residuals, z0)[0].scale, self.solver
         if getattr(solver, "reach", None) is not None:
             solver = eqx.tree_at(lambda s: s.reach, solver, jnp.delete(solver.reach, index))
         if len(z0) == 1:
-            at = [residuals(self.space.free(rebuild(flat.at[index].set(value)))) for value in values]
-            return np.array([0.5 * float(jnp.sum(r**2)) for r in at])
+            residuals_at_values = [residuals(self.space.free(rebuild(flat.at[index].set(value)))) for value in values]
+            return np.array([0.5 * float(jnp.sum(r**2)) for r in residuals_at_values])
         losses = np.empty(len(values))
-        rest = jnp.delete(z0, index)
+        other_unknowns = jnp.delete(z0, index)
         # From the optimum outwards, so that each search begins at the solution of the nearest value.
         order = np.argsort(np.abs(values - float(flat[index])))
         solutions: dict[int, Array] = {}
@@ -226,7 +227,7 @@ class Problem(eqx.Module):
             if not np.isfinite(held):
                 raise ValueError(f"{name} = {values[k]:g} is outside the range of the parameter.")
             nearest = min(solutions, key=lambda j: abs(values[j] - values[k]), default=None)
-            z = rest if nearest is None else solutions[nearest]
+            z = other_unknowns if nearest is None else solutions[nearest]
             solution = _profiled(residuals, solver, scale, z, held, index, self.reverse, max_iterations)
             solutions[int(k)] = solution.value
             losses[k] = 0.5 * float(jnp.sum(solution.aux**2))
@@ -247,27 +248,27 @@ def jacobian_of(residuals, z, reverse):
 @eqx.filter_jit
 def values_of(residuals, z):
     """Residuals and misfit, compiled once for a problem."""
-    return residuals.both(z)
+    return residuals.residuals_and_misfit(z)
 
 
 @eqx.filter_jit
 def _gradient(residuals, z):
     def loss(z):
-        values = residuals.both(z)
+        values = residuals.residuals_and_misfit(z)
         return 0.5 * jnp.sum(values[0] ** 2), values
 
     return jax.grad(loss, has_aux=True)(z)
 
 
 @eqx.filter_jit
-def _profiled(residuals, solver, scale, rest, held, index, reverse, max_iterations):
-    def scaled(rest, args):
+def _profiled(residuals, solver, scale, other_unknowns, held, index, reverse, max_iterations):
+    def scaled(other_unknowns, args):
         del args
-        z = jnp.concatenate([rest[:index], held[None], rest[index:]])
+        z = jnp.concatenate([other_unknowns[:index], held[None], other_unknowns[index:]])
         value = _linearised(z, residuals, reverse)
         return scale * value, value
 
-    return optx.least_squares(scaled, solver, rest, has_aux=True, throw=False, max_steps=max_iterations)
+    return optx.least_squares(scaled, solver, other_unknowns, has_aux=True, throw=False, max_steps=max_iterations)
 
 
 def prepare(
@@ -293,7 +294,7 @@ def prepare(
             _TRACED[key] = traced
             while len(_TRACED) > _MAX_TRACED:
                 _TRACED.popitem(last=False)
-    run, adjoint, reverse, num_residuals, how = traced
+    run, adjoint, reverse, num_residuals, mode_description = traced
     num_values = num_residuals - data.values.size + data.num_values
     if num_values < z.size:
         raise ValueError(
@@ -302,7 +303,7 @@ def prepare(
         )
     residuals = dataclasses.replace(plain, adjoint=adjoint)
     program = Program(run, eqx.filter(_without_model(plain), is_on_device))
-    return Problem(residuals, program, solver, reverse, f"{name}, {how}")
+    return Problem(residuals, program, solver, reverse, f"{name}, {mode_description}")
 
 
 def is_on_device(leaf: Any) -> bool:
@@ -323,30 +324,34 @@ def _traced(plain: FitResiduals, z: Array, is_least_squares: bool) -> tuple[Any,
     """The traced residuals, their adjoint, whether derivatives are taken in reverse mode, the number of residuals, and
     the mode of differentiation in words.
 
-    The arrays of the model are concrete during tracing, because quantities of a surface that are computed on the host
-    need that. They become arguments afterwards, so that the program holds no large constants.
+    Host computations on a surface need concrete arrays, so the model's arrays are concrete during tracing. They become
+    arguments afterwards, so that the program holds no large constants.
     """
     takes_adjoint = plain.adjoint is not None
     plain.data.check(eqx.filter_eval_shape(lambda z: plain.predicted(z), z))
     num_residuals = eqx.filter_eval_shape(lambda z: plain(z), z).size
-    reverse, how = True, f"gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}"
-    if is_least_squares:
-        reverse, how = False, f"Jacobian in forward mode with {z.size} tangents per run"
-        if not _has_forward_mode(plain, z):
-            if num_residuals > MANY:
-                raise ValueError(
-                    "The model cannot be differentiated in forward mode. Let it take adjoint= and pass it on to "
-                    "ltl.solve, or choose a method that needs only gradients: method=optx.BFGS(rtol, atol)."
-                )
-            reverse, how = True, f"Jacobian in reverse mode with {num_residuals} rows"
-    else:
+    if not is_least_squares:
         plain = dataclasses.replace(plain, adjoint=None)
-    arrays, rest = eqx.partition(_without_model(plain), is_on_device)
-    own = dict(model=plain.model, penalty=plain.penalty, adjoint=plain.adjoint)
-    run = eqx.filter_closure_convert(
-        lambda arrays, z: dataclasses.replace(eqx.combine(arrays, rest), **own).both(z), arrays, z
-    )
-    return run, plain.adjoint, reverse, num_residuals, how
+        reverse = True
+        mode_description = f"gradients in reverse mode{' with checkpoints' if takes_adjoint else ''}"
+    elif _has_forward_mode(plain, z):
+        reverse, mode_description = False, f"Jacobian in forward mode with {z.size} tangents per run"
+    elif num_residuals <= MANY:
+        reverse, mode_description = True, f"Jacobian in reverse mode with {num_residuals} rows"
+    else:
+        raise ValueError(
+            "The model cannot be differentiated in forward mode. Let it take adjoint= and pass it on to ltl.solve, or "
+            "choose a method that needs only gradients: method=optx.BFGS(rtol, atol)."
+        )
+    arrays, constants = eqx.partition(_without_model(plain), is_on_device)
+    model_parts = dict(model=plain.model, penalty=plain.penalty, adjoint=plain.adjoint)
+
+    def residuals_and_misfit(arrays: Any, z: Array) -> tuple[Array, Array]:
+        residuals = dataclasses.replace(eqx.combine(arrays, constants), **model_parts)
+        return residuals.residuals_and_misfit(z)
+
+    run = eqx.filter_closure_convert(residuals_and_misfit, arrays, z)
+    return run, plain.adjoint, reverse, num_residuals, mode_description
 
 
 def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
@@ -356,12 +361,13 @@ def _key(plain: FitResiduals, z: Array, is_least_squares: bool) -> Hashable:
     Model and penalty enter by their arrays, by the source of their functions, and by the values that these functions
     read from enclosing functions and modules, so that a changed value gives another key.
     """
-    arrays, rest = eqx.partition(_without_model(plain), is_on_device)
+    arrays, constants = eqx.partition(_without_model(plain), is_on_device)
     shapes = tuple((leaf.shape, str(leaf.dtype), bool(leaf.weak_type)) for leaf in jax.tree.leaves(arrays))
-    leaves, structure = jax.tree.flatten(rest)
+    leaves, structure = jax.tree.flatten(constants)
     try:
-        own = plain.model, plain.penalty, leaves
-        key = shapes, structure, fingerprint((*own, read_from_modules(own))), z.shape, str(z.dtype), is_least_squares
+        key_parts = plain.model, plain.penalty, leaves
+        content = fingerprint((*key_parts, read_from_modules(key_parts)))
+        key = shapes, structure, content, z.shape, str(z.dtype), is_least_squares
         hash(key)
     except TypeError:
         return None
@@ -398,7 +404,8 @@ def steps_adaptively(model: Model) -> bool:
 def _has_forward_mode(residuals: FitResiduals, z: Array) -> bool:
     """Whether the residuals can be differentiated in forward mode."""
     try:
-        # JAX raises for functions with a reverse mode only when it maps over tangents, so all of them are pushed.
+        # For a function that has only a reverse mode, JAX raises when tangents are mapped, not for a single one. So
+        # push all of them.
         jax.eval_shape(lambda z: _jacobian(residuals, z, False), z)
     except TypeError:
         return False

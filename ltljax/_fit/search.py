@@ -45,14 +45,14 @@ class End:
 
 
 def search(
-    solver: Any, function: Any, z: Array, iterations: Any, unit: Callable[[float], float],
+    solver: Any, objective: Any, z: Array, iterations: Any, unit: Callable[[float], float],
     after: Callable[[int, float, Array], bool],
 ) -> End:  # fmt: skip
     """Minimise until the loss settles, the model fails, or the caller stops the search.
 
     Args:
         solver: solver of optimistix.
-        function: function to minimise, with the factor ``scale`` of the residuals.
+        objective: function to minimise, with the factor ``scale`` of the residuals.
         z: first unknowns.
         iterations: iterable over the numbers of the iterations, such as a progress bar.
         unit: ``loss -> number``, half the variance of the noise.
@@ -62,11 +62,11 @@ def search(
         FitError: the model fails at the first unknowns.
     """
     options: dict[str, Any] = {}
-    y, state, best = z, _begin(solver, function, z, options), z
+    y, state, best = z, _begin(solver, objective, z, options), z
     losses: list[float] = []
     for iteration in iterations:
-        y, state, outcome = _iterate(solver, function, y, options, state)
-        loss = float(outcome.loss / function.scale**2)
+        y, state, outcome = _iterate(solver, objective, y, options, state)
+        loss = float(outcome.loss / objective.scale**2)
         if not np.isfinite(loss):
             if iteration == 0:
                 raise FitError(
@@ -120,21 +120,21 @@ class _Outcome(eqx.Module):
 
 
 @eqx.filter_jit
-def _begin(solver, function, z, options):
-    struct, aux = eqx.filter_eval_shape(function, z, None)
-    return solver.init(function, z, None, options, struct, aux, frozenset())
+def _begin(solver, objective, z, options):
+    struct, aux = eqx.filter_eval_shape(objective, z, None)
+    return solver.init(objective, z, None, options, struct, aux, frozenset())
 
 
 @eqx.filter_jit
-def _iterate(solver: Any, function: Any, z: Array, options: dict[str, Any], state: Any) -> tuple[Array, Any, _Outcome]:
+def _iterate(solver: Any, objective: Any, z: Array, options: dict[str, Any], state: Any) -> tuple[Array, Any, _Outcome]:
     if isinstance(solver, optx.OptaxMinimiser):
         # The loss in its state is the loss at the beginning of the step.
-        next_z, state, _ = solver.step(function, z, None, options, state, frozenset())
+        next_z, state, _ = solver.step(objective, z, None, options, state, frozenset())
         none = jnp.array(0)
         return next_z, state, _Outcome(z, state.f, state.terminate, none, none, 1)
     before = state.f_info.as_min()
-    next_z, state, _ = solver.step(function, z, None, options, state, frozenset())
-    done, _ = solver.terminate(function, z, None, options, state, frozenset())
+    next_z, state, _ = solver.step(objective, z, None, options, state, frozenset())
+    done, _ = solver.terminate(objective, z, None, options, state, frozenset())
     loss, trials, most = state.f_info.as_min(), state.search_state, solver.search.most
     if not isinstance(solver, Marquardt):
         # Close to a minimum, rounding errors of the loss may keep the solver from detecting convergence.

@@ -81,11 +81,10 @@ class Charts:
         equally many edges the straightest one that passes the least curvature.
         """
         num_vertices = len(self._cone)
-        none = self._directions.no_half_edge
         owner = np.arange(len(vertices))
         at = np.asarray(vertices, np.int64)
         position, turn = np.zeros(len(at), complex), np.zeros(len(at))
-        path = np.full((len(at), self.longest_path), none, np.int32)
+        path = np.full((len(at), self.longest_path), self._directions.no_half_edge, np.int32)
         known = np.sort(owner * num_vertices + at)
         reached = []
         for ring in range(rings):

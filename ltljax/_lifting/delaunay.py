@@ -43,14 +43,14 @@ def delaunay_triangulation(
     vertices: np.ndarray,
     ring: Table,
     ring_blocks: tuple[RingTopology, ...],
-    is_folded: np.ndarray,
+    is_near_fold: np.ndarray,
 ) -> tuple[Triangulation, HalfEdges, RingAngles]:
     """The intrinsic Delaunay triangulation of a mesh, its half-edges, and the angles of the mesh itself.
 
     Every round flips a set of edges that do not share a face, and then checks the edges around them. Edges whose
     opposite angles exceed pi the most are flipped first.
 
-    An edge between two vertices marked in ``is_folded`` is never flipped, so that no new edge leads through a folded
+    An edge between two vertices marked in ``is_near_fold`` is never flipped, so that no new edge leads through a folded
     face. All edges at other vertices become Delaunay, which keeps the cotangent weights there non-negative.
 
     Args:
@@ -58,7 +58,7 @@ def delaunay_triangulation(
         vertices: (V, 3) positions.
         ring: the one-rings.
         ring_blocks: for every block of ``ring``, which slots hold neighbours and faces.
-        is_folded: (V,) mask of the corners of faces that are folded over, and of their neighbours.
+        is_near_fold: (V,) mask of the corners of faces that are folded over, and of their neighbours.
     """
     ends, following = _connectivity(faces, len(vertices))
     tails = ends.ravel().copy()
@@ -70,7 +70,7 @@ def delaunay_triangulation(
     face_of[corner] = np.minimum(corner, np.minimum(following[corner], following[following[corner]]))
     levels, candidates = [], np.arange(len(ends))
     while len(candidates):
-        is_frozen = is_folded[tails[2 * candidates]] & is_folded[tails[2 * candidates + 1]]
+        is_frozen = is_near_fold[tails[2 * candidates]] & is_near_fold[tails[2 * candidates + 1]]
         candidates = candidates[~is_frozen]
         excess = _excess(candidates, following, face_of, lengths)
         violating, excess = candidates[excess > _TIE], excess[excess > _TIE]
@@ -156,15 +156,18 @@ def _independent(edges: np.ndarray, excess: np.ndarray, face_of: np.ndarray) -> 
     return (first[sides[0]] == rank) & (first[sides[1]] == rank)
 
 
-def opposite_edges(half_edges: HalfEdges, which: np.ndarray, none: int) -> np.ndarray:
+def opposite_edges(half_edges: HalfEdges, which: np.ndarray, no_edge: int) -> np.ndarray:
     """The edges of the two faces beside each half-edge, (5, N).
 
     The first row is the edge of the half-edge itself. Then follow the other two edges of the face on its left and of
-    the face on its right; ``none`` where there is no face.
+    the face on its right; ``no_edge`` where there is no face.
     """
     edges = [which >> 1]
     for side in (which, which ^ 1):
         ahead = half_edges.following[side]
         has_face = ahead >= 0
-        edges += [np.where(has_face, ahead >> 1, none), np.where(has_face, half_edges.following[ahead] >> 1, none)]
+        edges += [
+            np.where(has_face, ahead >> 1, no_edge),
+            np.where(has_face, half_edges.following[ahead] >> 1, no_edge),
+        ]
     return np.stack(edges)

@@ -126,7 +126,7 @@ def ring_angles(
     missing = [xp.max(block) for block in ring.each(lambda *a: _missing(*_sides(vertices, *a)), ring_blocks)]
     added = xp.maximum(xp.max(xp.stack(missing)), 0)
 
-    def around(block, topology):
+    def angles_of_block(block, topology):
         has_face, ahead, behind, across = _sides(vertices, block, topology)
         # Where no face follows, use the sides of an equilateral triangle, whose angle has finite derivatives.
         sides = (xp.where(has_face, side + added, 1) for side in (across, ahead, behind))
@@ -139,7 +139,7 @@ def ring_angles(
         first = np.pi - xp.arctan2(tangent[1], xp.where(topology.is_boundary, tangent[0], 1))
         return xp.cumsum(angles, axis=0) - angles, total, first
 
-    corners, sums, first = zip(*ring.each(around, ring_blocks), strict=True)
+    corners, sums, first = zip(*ring.each(angles_of_block, ring_blocks), strict=True)
     return RingAngles(lengths + added, corners, ring.rows_from(list(sums)), ring.rows_from(list(first)))
 
 
@@ -150,14 +150,16 @@ def directions(angles: RingAngles, triangulation: Triangulation, kinds: Int[AnyA
     axis is the conormal of the first side.
     """
     xp = angles.lengths.__array_namespace__()
-    lengths, around = flipped(angles, triangulation)
+    lengths, half_edge_angles = flipped(angles, triangulation)
     inside = kinds == INTERIOR
     scale = xp.where(inside, 2 * np.pi / xp.where(inside, angles.sums, 1), 1)
     start = xp.where(inside, 0, xp.where(kinds >= RIGHT_CORNER, -np.pi, angles.first))
     tails = triangulation.tails
-    around = take(start, tails) + take(scale, tails) * around
-    none = xp.asarray([0, np.pi], dtype=around.dtype)
-    return Directions(xp.concatenate([lengths, none[:1]]), xp.concatenate([around, none]), angles.sums)
+    half_edge_angles = take(start, tails) + take(scale, tails) * half_edge_angles
+    # The two half-edges of the edge of length zero, with which paths are padded.
+    padding = xp.asarray([0, np.pi], dtype=half_edge_angles.dtype)
+    lengths = xp.concatenate([lengths, padding[:1]])
+    return Directions(lengths, xp.concatenate([half_edge_angles, padding]), angles.sums)
 
 
 def flipped(angles: RingAngles, triangulation: Triangulation) -> tuple[Float[AnyArray, " E"], Float[AnyArray, " H"]]:
@@ -165,21 +167,22 @@ def flipped(angles: RingAngles, triangulation: Triangulation) -> tuple[Float[Any
     xp = angles.lengths.__array_namespace__()
     flips = triangulation.flips
     lengths = angles.lengths
-    around = take(xp.concatenate([block.reshape(-1) for block in angles.corners]), triangulation.slots)
+    half_edge_angles = take(xp.concatenate([block.reshape(-1) for block in angles.corners]), triangulation.slots)
     if not flips.flipped.shape[0]:
-        return lengths, around
+        return lengths, half_edge_angles
     # Unused entries of narrow levels flip one additional edge, of length one.
     unit_length = xp.ones(1, dtype=lengths.dtype)
-    start = xp.concatenate([lengths, unit_length]), xp.concatenate([around, 0 * unit_length, 0 * unit_length])
-    if isinstance(around, np.ndarray):
+    padded_angles = xp.concatenate([half_edge_angles, 0 * unit_length, 0 * unit_length])
+    start = xp.concatenate([lengths, unit_length]), padded_angles
+    if isinstance(padded_angles, np.ndarray):
         for level in zip(flips.flipped, flips.around, strict=True):
             start = flip(*start, *level)
-        lengths, around = start
+        lengths, half_edge_angles = start
     else:
         # Unrolled, even a few levels would take XLA seconds to compile.
         levels = flips.flipped, flips.around
-        (lengths, around), _ = jax.lax.scan(lambda carry, level: (flip(*carry, *level), None), start, levels)
-    return lengths[:-1], around[:-2]
+        (lengths, half_edge_angles), _ = jax.lax.scan(lambda carry, level: (flip(*carry, *level), None), start, levels)
+    return lengths[:-1], half_edge_angles[:-2]
 
 
 def flip(

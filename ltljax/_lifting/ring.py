@@ -1,5 +1,8 @@
 """The one-ring of a vertex: its faces, its normal, and its image in the tangent plane.
 
+The lifts here map positions in space: "projection" and "chord". The lift in charts, by edge lengths alone, is in
+`intrinsic`.
+
 Rings are slot-major: ``offsets[k, v]`` is the position of neighbour k of vertex v relative to v. Neighbours are in
 counter-clockwise order, and an empty slot holds zero. Face k lies between slots k and k + 1. The ring of an interior
 vertex is closed; the ring of a boundary vertex is open.

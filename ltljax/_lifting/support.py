@@ -17,21 +17,23 @@ from .ring import Lift, lifted_ring
 # A ring determines a polynomial of a degree well if the smallest eigenvalue of its moment matrix, scaled to unit
 # diagonal, exceeds this. For quadratics it is 0.29 on a regular hexagon, and 0 for neighbours on a conic through the
 # vertex.
-_WELL_PLACED = {2: 0.02, 3: 0.003, 4: 0.001}
+_WELL_CONDITIONED = {2: 0.02, 3: 0.003, 4: 0.001}
 # Below this eigenvalue a ring does not determine a polynomial at all.
-_PLACED = 1e-8
+_DETERMINED = 1e-8
 # Relative moment residual below which a row counts as consistent.
 CONSISTENT = 1e-8
-# Rows with neighbours beyond the third ring would no longer be local.
+# Largest number of rings from which a non-negative row is chosen, so that operators stay local.
 LARGEST_RING = 3
-# The largest number of rings of a fit, by degree.
+# Largest number of rings from which the row of a fit is chosen, by degree.
 LARGEST_FIT = {2: 3, 3: 5, 4: 5}
+# Largest number of passes in which a non-negative row is selected.
+_MAX_PASSES = 3
 # Vertices per batch.
 _BATCH = 1 << 13
 
 # Returns the neighbourhoods of vertices (N,) within k edges.
 Reach = Callable[[np.ndarray, int], Neighbourhood]
-# Passes on the batches it is given, and may show progress.
+# Yields the given batches and may report progress.
 Watch = Callable[[list[np.ndarray]], Iterable[np.ndarray]]
 
 
@@ -50,9 +52,9 @@ class Rows:
     paths: np.ndarray
 
     @classmethod
-    def all_of(cls, around: Neighbourhood) -> "Rows":
+    def all_of(cls, neighbourhood: Neighbourhood) -> "Rows":
         """Rows that hold the whole neighbourhood of every vertex."""
-        return cls(around.offsets, around.members, around.paths)
+        return cls(neighbourhood.offsets, neighbourhood.members, neighbourhood.paths)
 
     def replaced(self, owners: np.ndarray, members: np.ndarray, paths: np.ndarray, which: np.ndarray) -> "Rows":
         """Copies of the rows in which the rows of the vertices ``which`` are replaced by entries (n,) with owners."""
@@ -158,16 +160,16 @@ def fit_support(rings: Rows, degree: int, reach: Reach, watch: Watch) -> tuple[R
     )
     rows, remaining = rings, np.arange(len(rings.offsets) - 1)
     wide = remaining
-    for attempt, (ring, nearest) in enumerate(choices):
+    for attempt, (ring, num_nearest) in enumerate(choices):
         chosen = _Chosen()
         for batch, candidates, lifted, paths in _candidates(remaining, rings, ring, reach, watch):
             is_used = candidates != batch[None]
-            if nearest is not None and nearest < len(candidates):
+            if num_nearest is not None and num_nearest < len(candidates):
                 distance = np.where(is_used, np.sum(lifted**2, axis=-1), np.inf)
-                is_used &= distance <= np.partition(distance, nearest - 1, axis=0)[nearest - 1]
+                is_used &= distance <= np.partition(distance, num_nearest - 1, axis=0)[num_nearest - 1]
                 lifted = np.where(is_used[..., None], lifted, 0)
             is_last = attempt == len(choices) - 1
-            threshold = _PLACED if is_last else _WELL_PLACED[degree]
+            threshold = _DETERMINED if is_last else _WELL_CONDITIONED[degree]
             chosen.add(batch, candidates, paths, is_used, fit_quality(lifted, degree) > threshold)
         rows = chosen.replace(rows)
         remaining = chosen.insufficient()
@@ -181,8 +183,8 @@ def fit_quality(lifted: np.ndarray, degree: int) -> np.ndarray:
     moments, weights, _ = ring_moments(lifted, np.zeros(lifted.shape[1], np.int8), degree)
     matrix = np.moveaxis(moment_matrix(moments, weights), -1, 0)
     diagonal = np.einsum("nii->ni", matrix)
-    unscaled = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    return np.linalg.eigvalsh(matrix * unscaled[:, :, None] * unscaled[:, None])[:, 0]
+    inverse_root = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    return np.linalg.eigvalsh(matrix * inverse_root[:, :, None] * inverse_root[:, None])[:, 0]
 
 
 def nonnegative_support(
@@ -238,27 +240,28 @@ def _nonnegative_rows(
     is_picked = np.sum(lifted**2, axis=-1) > 0
     residual = np.ones(len(kinds))
     # The moments are scaled by the radius of the row, which depends on the selection. If the row is exact, the scale
-    # does not matter and one pass suffices. Otherwise the passes converge to the row that the weights recompute.
-    todo = np.flatnonzero(is_picked.any(axis=0))
-    for _ in range(LARGEST_RING):
+    # does not matter and one pass suffices. Otherwise repeat until the selection agrees with the scale that
+    # `operator_weights` computes from it.
+    unsettled = np.flatnonzero(is_picked.any(axis=0))
+    for _ in range(_MAX_PASSES):
         moments, weights, scale = ring_moments(
-            np.where(is_picked[..., None], lifted, 0)[:, todo], kinds[todo], 2, emphasis
+            np.where(is_picked[..., None], lifted, 0)[:, unsettled], kinds[unsettled], 2, emphasis
         )
-        target = conditions(scaled_targets(targets[None, :, todo], scale, emphasis), kinds[todo], 1)[0]
+        target = conditions(scaled_targets(targets[None, :, unsettled], scale, emphasis), kinds[unsettled], 1)[0]
         matrices = np.ascontiguousarray(np.moveaxis(moments * weights[None], -1, 0))
-        c, has_failed = np.zeros(weights.shape), np.zeros(len(todo), bool)
+        c, has_failed = np.zeros(weights.shape), np.zeros(len(unsettled), bool)
         for i, (matrix, right_hand_side) in enumerate(zip(matrices, np.ascontiguousarray(target.T), strict=True)):
             try:
                 c[:, i] = nnls(matrix, right_hand_side)[0]
             except RuntimeError:  # SciPy's iteration did not converge
                 has_failed[i] = True
         reached = np.einsum("ikn,kn->in", moments, weights * c)
-        residual[todo] = relative_residual(target[None], reached[None], emphasis)[0]
-        residual[todo[has_failed]] = np.inf
-        changed = np.any(is_picked[:, todo] != (c > 0), axis=0) & np.any(c > 0, axis=0)
-        is_picked[:, todo] = c > 0
-        todo = todo[changed & ~(residual[todo] <= CONSISTENT)]
-        if not len(todo):
+        residual[unsettled] = relative_residual(target[None], reached[None], emphasis)[0]
+        residual[unsettled[has_failed]] = np.inf
+        changed = np.any(is_picked[:, unsettled] != (c > 0), axis=0) & np.any(c > 0, axis=0)
+        is_picked[:, unsettled] = c > 0
+        unsettled = unsettled[changed & ~(residual[unsettled] <= CONSISTENT)]
+        if not len(unsettled):
             break
     return is_picked, residual
 
@@ -277,20 +280,26 @@ def _candidates(
     vertices = vertices[np.argsort(lengths, kind="stable")]
     batches = [vertices[start : start + _BATCH] for start in range(0, len(vertices), _BATCH)]
     for batch in watch(batches):
-        around = reach(batch, ring)
-        sizes = np.diff(around.offsets)
+        neighbourhood = reach(batch, ring)
+        sizes = np.diff(neighbourhood.offsets)
         # Split the batch by size, so that a long row does not pad all of it.
         by_size = np.argsort(sizes, kind="stable")
         cuts = np.flatnonzero(np.diff(np.ceil(np.log2(np.maximum(sizes[by_size], 16))))) + 1
         # Empty slots read one additional entry at the end.
-        positions = np.append(around.lifted, np.zeros((1, 2)), axis=0)
-        paths = np.append(around.paths, np.zeros((1, around.paths.shape[1]), np.int32), axis=0)
+        positions = np.append(neighbourhood.lifted, np.zeros((1, 2)), axis=0)
+        no_path = np.zeros((1, neighbourhood.paths.shape[1]), np.int32)
+        paths = np.append(neighbourhood.paths, no_path, axis=0)
         for part in np.split(by_size, cuts):
             slot = np.arange(sizes[part].max(initial=0))[:, None]
             is_used = slot < sizes[part]
-            entry = np.where(is_used, around.offsets[part] + slot, len(around.members))
+            entry = np.where(is_used, neighbourhood.offsets[part] + slot, len(neighbourhood.members))
             own = batch[part]
-            yield own, np.where(is_used, np.append(around.members, 0)[entry], own), positions[entry], paths[entry]
+            yield (
+                own,
+                np.where(is_used, np.append(neighbourhood.members, 0)[entry], own),
+                positions[entry],
+                paths[entry],
+            )
 
 
 class _Chosen:

@@ -198,6 +198,7 @@ def places_in(
     directions: Directions | None,
 ) -> Places:
     """The layout of neighbours under a scheme, for given normals, frames and directions."""
+    # Under the intrinsic lift, rows in space use the chord lift, whose edges have their true lengths as well.
     lift = "projection" if scheme.lift == "projection" else "chord"
     return Places(vertices, normals, frames, directions, topology.is_creased, lift, scheme.transport)
 

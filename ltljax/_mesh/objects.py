@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from .errors import MeshError
-from .foreign import PolygonSoup, polygon_soup, polygons_of_cells
 from .mesh import Mesh
+from .package_readers import PolygonSoup, polygon_soup, polygons_of_cells
 from .polygons import triangulated
 
 _KNOWN = "a mesh of trimesh, PyVista, meshio or Open3D, a pair (vertices, faces), or a mapping with these two keys"

@@ -20,7 +20,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from . import foreign
+from . import package_readers
 from .errors import MeshError, UnreadableError
 from .ply import parse_ply
 from .polygons import triangulated
@@ -104,17 +104,17 @@ def read_freesurfer_text(path: Path) -> Polygons:
 def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
     """The arrays by name that a reader of another package returns for a file.
 
-    The reader runs in a process of its own, with limits on its memory and time; see `foreign`.
+    The reader runs in a process of its own, with limits on its memory and time; see `package_readers`.
 
     Args:
-        reader: a key of `foreign.READERS`.
+        reader: a key of `package_readers.PACKAGE_READERS`.
         path: the file.
 
     Raises:
         MeshError: the package is not installed, it does not accept the file, or reading takes too long.
         UnreadableError: the file is damaged, or reading it takes too much memory.
     """
-    package = foreign.PACKAGES[reader]
+    package = package_readers.PACKAGES[reader]
     if importlib.util.find_spec(package) is None:
         extra = "viz" if package == "pyvista" else "io"
         raise MeshError(f'reading this kind of file needs {package}. Run: pip install "ltljax[{extra}]"')
@@ -125,7 +125,7 @@ def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "arrays.npz"
         arguments = [reader, path.absolute(), target, memory, seconds, json.dumps([*map(str, sys.path)])]
-        command = [sys.executable, "-I", foreign.__file__, *map(str, arguments)]
+        command = [sys.executable, "-I", package_readers.__file__, *map(str, arguments)]
         try:
             process = subprocess.run(
                 command, capture_output=True, timeout=_PATIENCE * seconds, check=False, env=environment
@@ -146,7 +146,7 @@ def read_elsewhere(reader: str, path: Path) -> dict[str, np.ndarray]:
             return {name: arrays[f"array_{index}"] for index, name in enumerate(report["names"])}
 
 
-def _foreign_reader(reader: str) -> Callable[[Path], Polygons]:
+def _package_reader(reader: str) -> Callable[[Path], Polygons]:
     """The function that reads a mesh with a reader of another package."""
 
     def read(path: Path) -> Polygons:
@@ -169,7 +169,7 @@ def read_legacy_vtk(path: Path) -> Polygons:
     """The geometry of a legacy VTK file. meshio does not read POLYDATA, which most of these files contain."""
     with open(path, "rb") as file:
         is_surface = b"POLYDATA" in file.read(1000)
-    return _foreign_reader("vtk" if is_surface else "meshio")(path)
+    return _package_reader("vtk" if is_surface else "meshio")(path)
 
 
 READERS: dict[str, Callable[[Path], Polygons]] = {
@@ -180,12 +180,12 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     "glb": read_glb,
     "gltf": read_gltf,
     "vtk": read_legacy_vtk,
-    "vtu": _foreign_reader("meshio"),
-    "msh": _foreign_reader("meshio"),
-    "vtp": _foreign_reader("vtk"),
-    "gii": _foreign_reader("gifti"),
+    "vtu": _package_reader("meshio"),
+    "msh": _package_reader("meshio"),
+    "vtp": _package_reader("vtk"),
+    "gii": _package_reader("gifti"),
     "asc": read_freesurfer_text,
-    **dict.fromkeys(("pial", "white", "inflated", "orig", "smoothwm", "sphere"), _foreign_reader("freesurfer")),
+    **dict.fromkeys(("pial", "white", "inflated", "orig", "smoothwm", "sphere"), _package_reader("freesurfer")),
 }
 
 

@@ -82,9 +82,9 @@ class EllipticStencil(Stencil):
         if divergence_form:
             drift = _with_divergence(surface, diffusion, drift)
         targets = operator_targets(frames, diffusion, drift)
-        around = places(surface.scheme, surface.topology, surface.geometry)
+        layout = places(surface.scheme, surface.topology, surface.geometry)
         weights, residual, excess = weigh_rows(
-            around, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows
+            layout, surface.topology.kinds, targets, self.table, self.paths, self.cotangent_rows
         )
         flux = boundary_flux_weights(
             surface.topology, surface.geometry, targets, excess, self.table, self.cotangent_rows
@@ -140,18 +140,18 @@ def elliptic_stencil(
             "transformation. Build the stencil outside, and use its `with_coefficients` inside."
         )
     topology, geometry = jax.tree.map(_on_host, (surface.topology, surface.geometry))
-    around, kinds = places(surface.scheme, topology, geometry), topology.kinds
+    layout, kinds = places(surface.scheme, topology, geometry), topology.kinds
     tensor, frames = _checked(diffusion, geometry.frames), geometry.frames
     drift = None if drift is None else np.asarray(drift, np.float64)
     advection = largest_advection(operator_targets(frames, tensor, drift))
     if divergence_form:
         drift = np.asarray(_with_divergence(surface, diffusion, drift), np.float64)
     targets = operator_targets(frames, tensor, drift)
-    rows = _choose_rows(surface, topology, around, targets, progress)
+    rows = _choose_rows(surface, topology, layout, targets, progress)
     rows, cotangent_rows = with_cotangent_rows(rows, topology, is_isotropic(targets) & cotangent_vertices(topology))
-    table, paths = rows_table(rows, topology, around)
+    table, paths = rows_table(rows, topology, layout)
     table = reversible(table)
-    weights, residual, excess = weigh_rows(around, kinds, targets, table, paths, cotangent_rows)
+    weights, residual, excess = weigh_rows(layout, kinds, targets, table, paths, cotangent_rows)
     flux = boundary_flux_weights(topology, geometry, targets, excess, table, cotangent_rows)
     measured = None
     if surface.num_vertices <= MOST_MEASURED:
@@ -168,17 +168,17 @@ def elliptic_stencil(
 
 
 def _choose_rows(
-    surface: Surface, topology: Topology, around: Places, targets: np.ndarray, progress: bool
+    surface: Surface, topology: Topology, layout: Places, targets: np.ndarray, progress: bool
 ) -> support.Rows:
     """The neighbours of every row (host)."""
     reach = reach_along(
         one_rings(topology.faces, surface.num_vertices),
-        around,
-        charts_of(surface.scheme, topology, around),
+        layout,
+        charts_of(surface.scheme, topology, layout),
         topology.is_extrinsic,
     )
     rows = support.Rows.all_of(reach(np.arange(surface.num_vertices), 1))
-    _, residual, _ = weigh_rows(around, topology.kinds, targets, *rows_table(rows, topology, around), None)
+    _, residual, _ = weigh_rows(layout, topology.kinds, targets, *rows_table(rows, topology, layout), None)
     is_cotangent = is_isotropic(targets) & cotangent_vertices(topology)
     # The first pass finds rows that meet every condition; the second emphasises the drift in the other rows.
     for emphasis in (1.0, EMPHASIS):

@@ -1,4 +1,4 @@
-"""The rows of a general second-order operator: what each has to meet, and the weights that meet it.
+"""The rows of a general second-order operator: the moment conditions of each row, and weights that satisfy them.
 
 What enters: a diffusion tensor and a drift, a table of neighbours and their layout. What leaves: non-negative weights,
 residuals and flux weights. Pure functions, on the host in NumPy and in JAX alike, except where marked (host).
@@ -13,7 +13,7 @@ from .._lifting.layout import PerBlock, Places, block_paths, rows_last
 from .._lifting.weighing import Geometry, Topology, conormals_in_frame, flux_weights
 from .._tables import AnyArray, Table, build_table, slot_sum, slot_values
 
-# If not every condition can be met, the drift is met exactly and the excess of diffusion is minimised.
+# Factor by which the first-moment (drift) conditions count more than the second moments if not all can be met.
 EMPHASIS = 1e2
 
 
@@ -59,7 +59,11 @@ def largest_advection(targets: AnyArray) -> AnyArray:
 
 
 def rows_width(table: Table, weights: PerBlock, advection: AnyArray, measured: float | None = None) -> AnyArray:
-    """The spectral width of rows: from a measurement or an estimate without drift, plus the largest advection."""
+    """The spectral width of rows.
+
+    It is ``(sqrt(w) + sqrt(a))^2``, with w the width without drift, measured or estimated, and a the largest advection,
+    but at most ``2 max(row sums)``.
+    """
     xp = advection.__array_namespace__()
     sums = slot_sum(table, weights)
     if measured is None:
@@ -69,26 +73,26 @@ def rows_width(table: Table, weights: PerBlock, advection: AnyArray, measured: f
     return xp.asarray(xp.minimum(2 * xp.max(sums), (xp.sqrt(measured) + xp.sqrt(advection)) ** 2))
 
 
-def rows_table(rows: support.Rows, topology: Topology, around: Places) -> tuple[Table, tuple[Paths, ...] | None]:
+def rows_table(rows: support.Rows, topology: Topology, layout: Places) -> tuple[Table, tuple[Paths, ...] | None]:
     """The table of rows, and their paths if rows are laid out in charts (host)."""
     table = build_table(rows.offsets, rows.members)
-    if around.directions is None:
+    if layout.directions is None:
         return table, None
-    no_half_edge = around.directions.no_half_edge
+    no_half_edge = layout.directions.no_half_edge
     return table, block_paths(table, rows.offsets, rows.paths, no_half_edge, topology.is_extrinsic)
 
 
 def weigh_rows(
-    around: Places,
+    layout: Places,
     kinds: AnyArray,
     targets: AnyArray,
     table: Table,
     paths: tuple[Paths, ...] | None,
     cotangent_rows: tuple[CotangentRows, ...] | None,
 ) -> tuple[PerBlock, AnyArray, AnyArray]:
-    """The weights, the residual of every row, and its first moments (V, 2) minus the drift."""
+    """The weights, the residual of every row, and the excess (V, 2) of the first moments over the drift."""
 
-    def rows(block, lifted):
+    def weigh_block(block, lifted):
         xp = lifted.__array_namespace__()
         lifted = xp.moveaxis(lifted, -1, 1)
         block_targets = block.centre(targets[0].T).T[None]
@@ -96,14 +100,14 @@ def weigh_rows(
         excess = xp.einsum("kn,kna->an", c[0], lifted) - block_targets[0, :2]
         return c[0], residual[0], excess
 
-    weights, residuals, excesses = zip(*table.each(rows, rows_last(around.lifted(table, paths))), strict=True)
+    weights, residuals, excesses = zip(*table.each(weigh_block, rows_last(layout.lifted(table, paths))), strict=True)
     excess = table.rows_from([part.T for part in excesses])
-    if cotangent_rows is None or around.directions is None:
+    if cotangent_rows is None or layout.directions is None:
         return weights, table.rows_from(list(residuals)), excess
     blocks = []
     half_trace = (targets[0, 3] + targets[0, 4]) / 4
     for block, row, weight, residual in zip(table.blocks, cotangent_rows, weights, residuals, strict=True):
-        cotangent, area = cotangent_weights(around.directions, row)
+        cotangent, area = cotangent_weights(layout.directions, row)
         scaled = cotangent * block.part(row.columns).centre(half_trace)[None]
         exact = with_columns(residual[None], row.columns, 0 * area[None])[0]
         blocks.append((with_columns(weight, row.columns, scaled), exact))
@@ -121,8 +125,8 @@ def boundary_flux_weights(
 ) -> AnyArray:
     """The change of the operator per unit flux through both sides of each boundary vertex, (B, 2).
 
-    It follows from the excess of the first moments; for a row that is a multiple of the Laplacian's it is that multiple
-    of the Laplacian's flux weights.
+    It follows from the excess of the first moments over the drift. If a row is a multiple of the Laplacian's row, its
+    flux weights are the same multiple.
     """
     conormals = conormals_in_frame(topology, geometry.frames, geometry.conormals, geometry.directions)
     weights = flux_weights(excess[topology.boundary], conormals)
@@ -141,14 +145,14 @@ def boundary_flux_weights(
 
 
 def is_isotropic(targets: np.ndarray) -> np.ndarray:
-    """Whether the operator is a multiple of the Laplacian at each vertex, (V,) bool."""
+    """Whether the operator is a multiple of the Laplacian at each vertex, (V,) bool (host)."""
     x, y, xy, xx, yy = np.abs(targets[0])
     small = 1e-12 * (xx + yy)
     return (x <= small) & (y <= small) & (xy <= small) & (np.abs(targets[0, 3] - targets[0, 4]) <= small)
 
 
 def cotangent_vertices(topology: Topology) -> np.ndarray:
-    """Whether the Laplacian row of each vertex is a cotangent row, (V,) bool."""
+    """Whether the Laplacian row of each vertex is a cotangent row, (V,) bool (host)."""
     is_cotangent = np.zeros(len(topology.kinds), bool)
     if topology.cotangent_rows is not None and topology.diffusion is not None:
         for block, rows in zip(topology.diffusion.blocks, topology.cotangent_rows, strict=True):

@@ -1,4 +1,4 @@
-"""`save`: a mesh and fields on it in a file, whose suffix determines the format.
+"""`save` writes a mesh and its fields to a file; the suffix determines the format.
 
 `ltljax.load_fields` reads the fields back, and `ltljax.load_mesh` the mesh of most formats.
 """
@@ -77,8 +77,8 @@ def save(
     - GIfTI stores all fields in float32, with the mesh (``.gii``) or without it (``.func.gii``).
     - FreeSurfer's ``.curv`` and ``.thickness`` store a single scalar field.
     - GLB and OBJ show the first scalar field as colours. An OBJ gets a texture if the mesh has texture coordinates.
-    - STL and 3MF store the shape only. Positions in an STL of a shape far from the origin are relative to its middle,
-      because they are in float32.
+    - STL and 3MF store the shape only. STL stores float32, so a shape far from the origin is written relative to its
+      centre.
 
     An existing file is replaced once the new file is complete.
 
@@ -123,7 +123,7 @@ def save(
 def _move_into_place(draft: Path, path: Path) -> None:
     """Move the files of a draft to the folder of ``path``; raises if a file of the user is in the way."""
     written, folder = sorted(draft.iterdir()), path.parent
-    # The picture of an OBJ is replaced if the MTL file beside it is equal to the new one, so that `save` wrote both.
+    # A texture image is replaced only if the MTL file beside it equals the new one, which shows that `save` wrote both.
     material = draft / f"{path.stem}.mtl"
     has_same_material = material.exists() and (folder / material.name).exists()
     has_same_material = has_same_material and (folder / material.name).read_bytes() == material.read_bytes()

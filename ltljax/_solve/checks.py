@@ -147,10 +147,10 @@ def _diffuses_forwards(diffusivity: ArrayLike, where: str, u0: Array) -> None:
     )
 
 
-def parts_of_a_step(
+def num_substeps(
     equation: Equation, surface: Surface, u0: Array, t0: ArrayLike, dt: float, solver: diffrax.AbstractSolver
 ) -> int:
-    """The number of equal parts into which each fixed step is divided.
+    """The number of equal substeps of each fixed step.
 
     It exceeds one if a whole step of `RKL2` or `RKL1` is unstable even with the most stages, judged by the stiffest
     mode at the initial state. It is one if the stiffness is not known.
@@ -166,7 +166,7 @@ def parts_of_a_step(
         longest = solver.longest_step(solver.extent(t0, u0, (equation, surface)))
         if isinstance(longest, Tracer) or not (np.isfinite(longest) and longest > 0):
             return 1
-        # The margin allows for rounding of the times between parts.
+        # The margin allows for rounding of the times between substeps.
         return 1 if dt <= longest else int(np.ceil(1.02 * dt / float(longest)))
     elif isinstance(solver, diffrax.AbstractERK | diffrax.Euler):
         stiffest, width = _stiffest(equation, surface, u0, t0), equation.spectral_width(t0, surface, u0)

@@ -142,9 +142,9 @@ def _windows(surface: Surface) -> _Windows:
     are the other edges of the triangle behind that edge.
     """
     topology, vertices = jax.device_get((surface.topology, surface.vertices))
-    is_folded = np.zeros(len(vertices), bool) if topology.is_extrinsic is None else topology.is_extrinsic
+    is_near_fold = np.zeros(len(vertices), bool) if topology.is_extrinsic is None else topology.is_extrinsic
     _, half_edges, mesh_angles = delaunay_triangulation(
-        topology.faces, vertices.astype(np.float64), topology.ring, topology.ring_blocks, is_folded
+        topology.faces, vertices.astype(np.float64), topology.ring, topology.ring_blocks, is_near_fold
     )
     corners, places, opposite, last = _corners(half_edges)
     has_neighbour = half_edges.following[opposite ^ 1] >= 0

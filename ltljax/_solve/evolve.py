@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._base.arguments import as_numbers
 from .._base.deprecated import warn_deprecated
-from .._base.folder import Folder
+from .._base.owned_folder import Folder
 from .._equations import Equation
 from .._lifting.schemes import Paper, Polynomial
 from .._operators import growth_rate, spectral_bound, spectral_width
@@ -99,10 +99,11 @@ def solve(
 ) -> Solution:
     """The solution of an evolution equation at given times.
 
-    The default solver is `RKL2`, whose cost grows with the square root of the stiffness. It is `TRBDF2` for linear
-    equations and runs at least ``2e3 * rtol ** (-1 / 3)`` (4e4 by default) times as long as the fastest decay time, if
-    the extra `amg` is installed and the stiffness is known (not inside jit, grad or vmap). It is `diffrax.Tsit5` for
-    ``Paper`` surfaces, whose eigenvalues are off the real axis. ``solution.stats`` reports the solver and the reason.
+    The default solver is `RKL2`, whose cost grows with the square root of the stiffness. If the equation is linear and
+    the run lasts at least ``2e3 * rtol ** (-1 / 3)`` (4e4 by default) fastest decay times, it is `TRBDF2`, provided
+    that the extra `amg` is installed and the stiffness is known (not inside jit, grad or vmap). It is `diffrax.Tsit5`
+    for ``Paper`` surfaces, whose eigenvalues are off the real axis. ``solution.stats`` reports the solver and the
+    reason.
 
     Explicit solvers are those of diffrax, `RKL2` (stabilised, second order) and `RKL1` (stabilised, first order, with
     the maximum principle). Implicit solvers are `BackwardEuler`, `CrankNicolson`, `TRBDF2` and `diffrax.Kvaerno3`, `4`,
@@ -113,11 +114,11 @@ def solve(
 
     Derivatives in reverse mode through `RKL2` and `RKL1` cost three to five runs, more with steps of more than 36
     stages. They keep about ``12 sqrt(n)`` states for n fixed steps and 512 for adaptive ones, or as many as a gigabyte
-    holds (for each run of a batch). The lengths of adaptive steps count as constants: the derivative is accurate to the
-    error of the steps, and Taylor's test (`check_gradient`) shows slope 1, but slope 2 with ``dt``. Other solvers,
-    dense solutions, runs with ``progress``, traced times, and runs for which a gigabyte is too little use diffrax's
-    recursive checkpointing, which costs 5 to 10 runs. It keeps all fixed steps while that takes less than a gigabyte,
-    otherwise ``sqrt(2 max_steps)`` states and their rates, or as many as a gigabyte holds.
+    holds (for each run of a batch). Derivatives treat adaptive step lengths as constants, so they are accurate only to
+    the tolerance and `check_gradient` shows slope 1. With ``dt`` it shows slope 2. Other solvers, dense solutions, runs
+    with ``progress``, traced times, and runs for which a gigabyte is too little use diffrax's recursive checkpointing,
+    which costs 5 to 10 runs. It keeps all fixed steps while that takes less than a gigabyte, otherwise
+    ``sqrt(2 max_steps)`` states and their rates, or as many as a gigabyte holds.
 
     Args:
         equation: the equation, such as `Diffusion` or `ReactionDiffusion`.
@@ -168,7 +169,7 @@ def solve(
     _warn_of_growth(surface)
     problem = _Problem(equation, surface, u0, t0, t1)
     method = _choose(problem, solver, settings, dense, preconditioner)
-    grid = grid_of(t0, t1, times, settings.dt, method.parts)
+    grid = grid_of(t0, t1, times, settings.dt, method.substeps)
     is_plain = adjoint is None and not dense and not progress
     is_taped = is_plain and _can_be_taped(method.solver, grid, settings.max_steps, u0, (t0, t1, times))
     adjoint = checkpoints_for(grid, settings.max_steps, u0) if adjoint is None else adjoint
@@ -215,13 +216,13 @@ class _Method(NamedTuple):
     Attributes:
         solver: the solver, with the preconditioner and tolerances of its stages.
         description: name of the solver and the reason for its choice.
-        parts: number of equal parts in which each fixed step is taken.
+        substeps: number of equal substeps of each fixed step.
         uses_jacobi: whether implicit stages are preconditioned by Jacobi's method.
     """
 
     solver: diffrax.AbstractSolver
     description: str
-    parts: int = 1
+    substeps: int = 1
     uses_jacobi: bool = False
 
 
@@ -267,10 +268,10 @@ def _choose(
         uses_jacobi = isinstance(inverse, Jacobi)
         reason += f", stages preconditioned by {'Jacobi' if uses_jacobi else 'multigrid'}"
         return _Method(chosen, f"{name}: {reason}", uses_jacobi=uses_jacobi)
-    parts = 1 if settings.dt is None else checks.parts_of_a_step(equation, surface, u0, t0, settings.dt, chosen)
-    if parts > 1:
-        reason += f", each step in {parts} parts, since a whole one is unstable even with the most stages"
-    return _Method(chosen, f"{name}: {reason}", parts)
+    substeps = 1 if settings.dt is None else checks.num_substeps(equation, surface, u0, t0, settings.dt, chosen)
+    if substeps > 1:
+        reason += f", each step in {substeps} parts, since a whole one is unstable even with the most stages"
+    return _Method(chosen, f"{name}: {reason}", substeps)
 
 
 def _default(problem: _Problem, rtol: ArrayLike, dense: bool) -> tuple[diffrax.AbstractSolver, str]:

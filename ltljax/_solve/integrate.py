@@ -27,10 +27,10 @@ from .stepping import controller_of, first_step
 # A state overflows beyond this fraction of the largest floating-point number.
 _OVERFLOW = 1e-6
 
-# With a scheme that may have growing modes, a state overflows when it exceeds its initial size, or the change that the
-# initial rate would make during the run, by this factor.
+# With a scheme that may have growing modes, a state overflows when it exceeds this many times its initial size, or the
+# change that the rate at u0 would cause over the whole run, whichever is larger.
 _GROWTH = 1e6
-# Fractions of the run at which the source is evaluated for that.
+# Fractions of the run at which the rate at u0 is evaluated to estimate that change.
 _SOURCE_TIMES = (0.0, 0.382, 1.0)
 
 # Bytes that the checkpoints of diffrax may take.
@@ -137,7 +137,7 @@ def integrate(run: Run) -> Solution:
         return _by_taped_adaptive_steps(run)
     spacing = taped.spacing_of(len(run.grid) - 1, run.u0)
     marks, reverse_marks = (taped.marks_of(run.grid, np.asarray(run.ts), n) for n in (len(run.grid), spacing))
-    # Other values of the fields that are not needed would only cause another compilation.
+    # Taped fixed steps use neither field; None avoids a recompilation when they change.
     run = dataclasses.replace(run, adjoint=None, max_steps=None)
     return _by_taped_fixed_steps(run, marks, reverse_marks)
 
@@ -172,7 +172,7 @@ def _by_diffrax(run: Run) -> Solution:
     max_steps = run.max_steps
     if run.grid is not None:
         controller, dt0 = diffrax.StepTo(ts=run.grid), None
-        # The fewer the steps, the fewer the checkpoints.
+        # A smaller max_steps makes diffrax allocate fewer checkpoints.
         max_steps = min(len(run.grid) - 1, max_steps) if max_steps is not None else len(run.grid) - 1
     elif not isinstance(solver, diffrax.AbstractAdaptiveSolver):  # a run of zero length has no steps
         controller, dt0 = diffrax.ConstantStepSize(), jnp.ones_like(t1)
@@ -240,7 +240,7 @@ def _record_times(settings: _AdaptiveSettings, start: tuple[Array, Any], rules: 
 
 
 def _start_and_rules(run: Run, t0: Array, span: Array) -> tuple[tuple[Array, Any], taped.Rules]:
-    """The initial state with the rate, and the other rules of the run, as functions of time and state."""
+    """The differentiated parts of a run (initial state and rate), and the others as `taped.Rules`."""
     args = run.equation, run.surface
     u0 = run.equation.held(t0, run.surface, run.u0)
     # diffrax broadcasts the rate to the state and converts it to its dtype; so do taped steps.
@@ -276,13 +276,13 @@ def _without_derivative(tree: Any) -> Any:
 
 def _largest(surface: Surface, u0: Array, rate: Callable[[Array, Array], Array], t0: Array, span: Array) -> Array:
     """The magnitude beyond which a state of the run has overflowed."""
-    # The rate of a larger state, which is larger by the stiffness, could be infinite.
+    # Beyond this size the rate, which is larger than the state by up to the stiffness, could overflow.
     largest = jnp.asarray(_OVERFLOW * jnp.finfo(u0.dtype).max, u0.dtype)
     if isinstance(surface.scheme, Monotone):
         return largest
-    # Growing modes would reach that magnitude by ever shorter steps, so a state that has outgrown its start and the
-    # changes that the rates there would make ends the run. The rate is taken at several times, because a source may
-    # set in late.
+    # Growing modes would approach that limit in ever shorter steps. So the run also ends when the state exceeds
+    # `_GROWTH` times the larger of its initial size and the change that the rate at u0 would cause over the whole run.
+    # The rate is evaluated at several times, because a source may set in late.
     changes = [jnp.max(jnp.abs(rate(t0 + fraction * span, u0) * span)) for fraction in _SOURCE_TIMES]
     size = jnp.max(jnp.stack([jnp.max(jnp.abs(u0)), *changes]))
     return jnp.where(size > 0, jnp.minimum(largest, _GROWTH * size), largest)

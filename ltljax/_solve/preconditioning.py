@@ -1,7 +1,8 @@
-"""What the stages of implicit steps are preconditioned with, and how accurately they are solved.
+"""The choice of a preconditioner for an equation, and the accuracy to which the stages of implicit steps are solved.
 
-What enters: an equation and a surface, or the tolerances of a run. What leaves: a `Preconditioner`, and tolerances of
-the linear systems of a stage.
+What enters: an equation and a surface, or the tolerances of a run. What leaves: a `Preconditioner`, for the stages of
+implicit steps, `steady_state`, `poisson` and fairing; and tolerances of the linear systems of a stage. `krylov` defines
+the interface of preconditioners.
 """
 
 import equinox as eqx

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.folder import Folder
+from .._base.owned_folder import Folder
 from .fingerprint import fingerprint
 
 _RUN = "run.json"
@@ -71,7 +71,9 @@ class Keeper:
 
     Every file is either complete or absent, and is recorded as ltljax's own. A state that is not permanent is removed
     once two later ones exist, so neither the folder nor a single write grows with the length of a run. A damaged or
-    changed state is skipped and left in place.
+    changed state is skipped and left in place. The caller warns about the skipped files and decides from ``done`` where
+    the run continues: `solve` from its last state before the first requested one that is missing (see `intervals`), the
+    application from the frame before the first one that is missing.
 
     Args:
         folder: the folder, locked.

@@ -22,7 +22,7 @@ from .stabilised import Stabilised
 # The default absolute tolerance of a species is this fraction of rtol times its largest magnitude.
 ATOL_PER_RTOL = 1e-2
 
-# More fixed steps than this, parts included, are refused as a mistake.
+# A run of more fixed steps than this, substeps included, is refused as a mistake.
 _MOST_STEPS = 10_000_000
 
 
@@ -112,10 +112,10 @@ def _agree(value: Any, other: Any) -> bool:
     return np.array_equal(value, other)
 
 
-def grid_of(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None, parts: int) -> np.ndarray | None:
+def grid_of(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None, substeps: int) -> np.ndarray | None:
     """The times of fixed steps: t0, t1, multiples of dt and the requested times. None for adaptive steps.
 
-    Each step in between is divided into equal parts.
+    Each step in between is divided into equal substeps.
 
     Raises:
         ValueError: a time is being traced by JAX, or dt is too long.
@@ -131,12 +131,12 @@ def grid_of(t0: ArrayLike, t1: ArrayLike, ts: AnyArray, dt: float | None, parts:
     multiples = np.asarray(float(start) + dt * np.arange(1, count), ts.dtype)
     least = max(1e-6 * dt, 4 * float(np.finfo(ts.dtype).eps) * float(max(abs(start), abs(end))))
     grid = without_near_duplicates(start, end, (np.asarray(ts), multiples), least)
-    if parts > 1 and (dt / parts < least or len(grid) * parts > _MOST_STEPS):
+    if substeps > 1 and (dt / substeps < least or len(grid) * substeps > _MOST_STEPS):
         raise ValueError(
-            f"dt = {dt:g} is too long: each step would be taken in {parts} parts. Take shorter steps, leave dt out for "
-            "adaptive ones, or use ltl.TRBDF2()."
+            f"dt = {dt:g} is too long: each step would be taken in {substeps} parts. Take shorter steps, leave dt out "
+            "for adaptive ones, or use ltl.TRBDF2()."
         )
-    divided = grid[:-1, None] + np.diff(grid)[:, None] * (np.arange(parts) / parts)
+    divided = grid[:-1, None] + np.diff(grid)[:, None] * (np.arange(substeps) / substeps)
     return np.append(divided.ravel(), grid[-1]).astype(grid.dtype)
 
 

@@ -1,7 +1,7 @@
 """Runs of stabilised steps whose reverse pass takes the memory of only some of their states.
 
 What enters: a rate, a stepper, and the times of its steps or a function that finds them. What leaves: the states at
-some times, and the end of the run. The reverse pass (`tape.py`) takes the steps between kept states once more. A
+some times, and the end of the run. The reverse pass (`reverse_pass.py`) repeats the steps between kept states. A
 gradient of fixed steps costs a run, its repetition and its transpose, about three runs; checkpoints of whole steps cost
 six or more.
 """
@@ -19,20 +19,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._tables import AnyArray
+from .reverse_pass import Rate, Requests, Rules, Trajectory, increment, reverse
 from .stabilised import is_sensible
-from .tape import Rate, Requests, Rules, Trajectory, increment, reverse
 
-# Number of kept states, and of states on the tape, over the square root of the number n of fixed steps. With as many,
-# steps of up to 36 stages are taken again only once.
+# Number of kept states, and of states on the tape, over the square root of the number n of fixed steps. With so many,
+# steps of up to 36 stages are repeated only once.
 _KEPT = 6
-# The same numbers for adaptive steps, which are long and whose number is not known.
+# Number of kept states, and of states on the tape, for adaptive steps, whose number is not known in advance.
 _KEPT_OF_ADAPTIVE = 256
-# Shortest tape, and the bytes that the kept states may take, as may the tape, unless that is shorter.
+# Smallest number of states that are kept or on the tape, and the bytes that either of the two may take beyond it.
 _SHORTEST = 32
 _BYTES = 2**29
 
-# Number of tapes that a segment between two kept states may fill with steps of 36 stages. Its first steps are taken
-# again for each of them, and beyond this number recursive checkpoints are faster.
+# Number of tapes that a segment between two kept states may fill with steps of 36 stages. Its first steps are repeated
+# for each of them, and beyond this number recursive checkpoints are faster.
 _RETRACED = 25
 
 
@@ -210,12 +210,12 @@ def _forward(
 ) -> tuple[FixedRun, tuple[Array, Array]]:
     """The run; and the states at its marks, with the number of its steps."""
     u0, rate = start
-    take = functools.partial(_take, rate, rules, times)
+    take_step = functools.partial(_take_step, rate, rules, times)
 
     def to_mark(carry):
         i, states, progress = carry
         end = marks.ends[i]
-        progress = jax.lax.while_loop(lambda now: (now.step < end) & _goes_on(now), take, progress)
+        progress = jax.lax.while_loop(lambda progress: (progress.step < end) & _goes_on(progress), take_step, progress)
         return i + 1, states.at[i + 1].set(progress.state), progress
 
     zero, rate0 = jnp.zeros((), jnp.result_type(int)), rate(times[0], u0)
@@ -231,24 +231,24 @@ def _forward(
     return FixedRun(us, end.state, *end[3:], is_reached), (states, end.num_steps)
 
 
-def _take(rate: Rate, rules: Rules, times: Array, now: _Progress) -> _Progress:
+def _take_step(rate: Rate, rules: Rules, times: Array, progress: _Progress) -> _Progress:
     """The progress after one more step."""
-    begin, end, u = times[now.step], times[now.step + 1], now.state
-    is_done = now.overflowed | now.stopped
+    begin, end, u = times[progress.step], times[progress.step + 1], progress.state
+    is_done = progress.overflowed | progress.stopped
     plan = rules.stepper.plan(rules.extent(begin, u), end - begin)
     # A run that has ended takes no stages: the spectral bound of a NaN state would ask for all of them.
     stages = jnp.where(is_done, 0, plan.stages)
-    change, _ = increment(rate, plan, begin, u, now.rate, stages)
+    change, _ = increment(rate, plan, begin, u, progress.rate, stages)
     u1 = u + change
     rate1 = rate(end, u1)
-    is_good = plan.is_stable & is_sensible(plan.dt, u, change, now.rate, rate1)
+    is_good = plan.is_stable & is_sensible(plan.dt, u, change, progress.rate, rate1)
     u1 = jnp.where(is_done, u, jnp.where(is_good, u1, jnp.nan))
-    num_steps = now.num_steps + (~is_done).astype(now.num_steps.dtype)
-    num_evaluations = now.num_evaluations + stages.astype(now.num_steps.dtype)
+    num_steps = progress.num_steps + (~is_done).astype(progress.num_steps.dtype)
+    num_evaluations = progress.num_evaluations + stages.astype(progress.num_steps.dtype)
     overflowed, stopped = _has_ended(rules, end, u1, rate1)
     return _Progress(
-        now.step + 1, u1, rate1, num_steps, num_evaluations,
-        now.overflowed | ~is_done & overflowed, now.stopped | ~is_done & stopped,
+        progress.step + 1, u1, rate1, num_steps, num_evaluations,
+        progress.overflowed | ~is_done & overflowed, progress.stopped | ~is_done & stopped,
     )  # fmt: skip
 
 
@@ -260,6 +260,6 @@ def _has_ended(rules: Rules, t: Array, u: Array, rate: Array) -> tuple[Array, Ar
     return overflowed, ~overflowed & stopped
 
 
-def _goes_on(now: _Progress) -> Array:
-    # One answer for a whole batch. With one for each run, a batch would select among all kept states.
-    return eqxi.unvmap_any(~(now.overflowed | now.stopped))
+def _goes_on(progress: _Progress) -> Array:
+    # A single condition for the whole batch. With one for each run, every step would select among all kept states.
+    return eqxi.unvmap_any(~(progress.overflowed | progress.stopped))

@@ -18,7 +18,7 @@ from .._lifting.frames import tangent_frames
 from .._lifting.intrinsic import CotangentRows, Directions, RingAngles, directions
 from .._lifting.jets import LAPLACIAN, RIGHT_CORNER
 from .._lifting.layout import Places, block_paths
-from .._lifting.schemes import Monotone, Polynomial, Scheme
+from .._lifting.schemes import Monotone, Paper, Polynomial, Scheme
 from .._lifting.weighing import (
     Topology,
     diffusion_rows,
@@ -49,44 +49,44 @@ def choose_neighbours(
     vertices = mesh.vertices
     normals = ring_normals(scheme, vertices, topology.ring, topology.ring_blocks)
     is_intrinsic = isinstance(scheme, Monotone) and scheme.lift == "intrinsic"
-    on_crease, is_folded = None, at_folded_faces(mesh, normals)
+    on_crease, is_near_fold = None, at_folded_faces(mesh, normals)
     if is_intrinsic or isinstance(scheme, Polynomial):
-        on_crease = creased_vertices(mesh) & ~is_folded
-    topology, chart = _lay_charts(mesh, topology, scheme, is_folded, on_crease)
+        on_crease = creased_vertices(mesh) & ~is_near_fold
+    topology, chart = _lay_charts(mesh, topology, scheme, is_near_fold, on_crease)
 
     laps.end("charts")
     angles, chart_directions, charts = None, None, None
     if chart is not None:
         angles, chart_directions, charts = chart.angles, chart.directions, chart.charts
-    around = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
+    layout = Places(vertices, normals, tangent_frames(normals), chart_directions, None, "projection")
 
     def reach_of(is_extrinsic: np.ndarray | None) -> support.Reach:
-        return reach_along(rings, around, charts, is_extrinsic)
+        return reach_along(rings, layout, charts, is_extrinsic)
 
-    nearest = reach_of(topology.is_extrinsic)(np.arange(mesh.num_vertices), 1)
+    one_rings = reach_of(topology.is_extrinsic)(np.arange(mesh.num_vertices), 1)
     watch_gradient = watch("choosing the neighbours of the gradient")
     topology, report = _choose_gradient(
-        scheme, topology, reach_of, nearest, chart, on_crease, is_folded, watch_gradient
+        scheme, topology, reach_of, one_rings, chart, on_crease, is_near_fold, watch_gradient
     )
     laps.end("gradient rows")
     if isinstance(scheme, Polynomial):
         topology = dataclasses.replace(topology, diffusion=topology.jet, diffusion_paths=topology.jet_paths)
         return topology, angles, report
 
-    places, reach = around, reach_of(topology.is_extrinsic)
+    diffusion_layout, reach = layout, reach_of(topology.is_extrinsic)
     if chart is None or topology.is_extrinsic is not None:
         # Choose rows in space in the same tangent planes in which they will be weighed.
         normals = surface_normals(scheme, vertices, topology)
         frames, _ = vertex_frames(vertices, normals, topology)
-        places = places_in(scheme, topology, vertices, normals, frames, chart_directions)
-        reach = reach_along(rings, places, charts, topology.is_extrinsic)
-        nearest = reach(np.arange(mesh.num_vertices), 1)
+        diffusion_layout = places_in(scheme, topology, vertices, normals, frames, chart_directions)
+        reach = reach_along(rings, diffusion_layout, charts, topology.is_extrinsic)
+        one_rings = reach(np.arange(mesh.num_vertices), 1)
     topology, report = _choose_diffusion(
         scheme,
         topology,
-        places,
+        diffusion_layout,
         reach,
-        nearest,
+        one_rings,
         chart,
         watch("choosing the neighbours of the Laplacian"),
         report,
@@ -99,31 +99,33 @@ def _choose_gradient(
     scheme: Monotone | Polynomial,
     topology: Topology,
     reach_of: Callable[[np.ndarray | None], support.Reach],
-    nearest: Neighbourhood,
+    one_rings: Neighbourhood,
     chart: "_Chart | None",
     on_crease: np.ndarray | None,
-    is_folded: np.ndarray,
+    is_near_fold: np.ndarray,
     watch: support.Watch,
 ) -> tuple[Topology, SurfaceReport]:
     """The neighbours of the gradient.
 
     ``reach_of(is_extrinsic)`` finds wider neighbourhoods and lays those of the marked vertices out in space;
-    ``nearest`` holds the one-rings, already laid out.
+    ``one_rings`` are already laid out.
     """
-    one_ring = support.Rows.all_of(nearest)
+    one_ring_rows = support.Rows.all_of(one_rings)
     report = SurfaceReport(flips=0 if chart is None else chart.num_flips)
-    jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach_of(topology.is_extrinsic), watch)
+    jet, wide, undetermined = support.fit_support(one_ring_rows, scheme.degree, reach_of(topology.is_extrinsic), watch)
     if on_crease is not None:
         is_wide = np.full(len(on_crease), isinstance(scheme, Polynomial))
         is_wide[wide] = True
-        is_creased = (on_crease | (is_wide & _meets(jet, on_crease))) & ~is_folded
+        is_creased = (on_crease | (is_wide & _meets(jet, on_crease))) & ~is_near_fold
         if is_creased.any():
             topology = dataclasses.replace(topology, is_creased=is_creased)
             report = dataclasses.replace(report, creased=np.flatnonzero(is_creased))
             if isinstance(scheme, Polynomial):
                 # Choose the creased rows again, now laid out in charts.
                 topology = dataclasses.replace(topology, is_extrinsic=~is_creased)
-                jet, wide, undetermined = support.fit_support(one_ring, scheme.degree, reach_of(~is_creased), watch)
+                jet, wide, undetermined = support.fit_support(
+                    one_ring_rows, scheme.degree, reach_of(~is_creased), watch
+                )
     topology = dataclasses.replace(topology, **_table_of("jet", jet, topology, chart))
     return topology, dataclasses.replace(report, wide_gradient_rows=wide, undetermined=undetermined)
 
@@ -131,28 +133,28 @@ def _choose_gradient(
 def _choose_diffusion(
     scheme: Monotone,
     topology: Topology,
-    places: Places,
+    layout: Places,
     reach: support.Reach,
-    nearest: Neighbourhood,
+    one_rings: Neighbourhood,
     chart: "_Chart | None",
     watch: support.Watch,
     report: SurfaceReport,
 ) -> tuple[Topology, SurfaceReport]:
     """The neighbours of the Laplacian of `Monotone`.
 
-    ``reach`` finds wider neighbourhoods; ``nearest`` holds the one-rings, already laid out.
+    ``reach`` finds wider neighbourhoods; ``one_rings`` are already laid out.
     """
-    one_ring = support.Rows.all_of(nearest)
-    narrow = dataclasses.replace(topology, **_table_of("diffusion", one_ring, topology, chart))
-    _, residual, _, _ = diffusion_rows(scheme, places, narrow)
+    one_ring_rows = support.Rows.all_of(one_rings)
+    narrow = dataclasses.replace(topology, **_table_of("diffusion", one_ring_rows, topology, chart))
+    _, residual, _, _ = diffusion_rows(scheme, layout, narrow)
     is_consistent = residual <= support.CONSISTENT
     is_cotangent = np.zeros(len(is_consistent), bool)
     if chart is not None:
-        is_cotangent = _singular_corners(topology.kinds, chart.angles.sums, one_ring) | _is_uneven(nearest)
+        is_cotangent = _singular_corners(topology.kinds, chart.angles.sums, one_ring_rows) | _is_uneven(one_rings)
         if topology.is_extrinsic is not None:
             is_cotangent &= ~topology.is_extrinsic
     rows, record = support.nonnegative_support(
-        one_ring, is_consistent | is_cotangent, topology.kinds, LAPLACIAN.T, reach, watch
+        one_ring_rows, is_consistent | is_cotangent, topology.kinds, LAPLACIAN.T, reach, watch
     )
     if chart is not None:
         is_inconsistent = np.isin(np.arange(len(is_consistent)), record.inconsistent)
@@ -188,27 +190,31 @@ class _Chart:
 
 
 def _lay_charts(
-    mesh: Mesh, topology: Topology, scheme: Monotone | Polynomial, is_folded: np.ndarray, on_crease: np.ndarray | None
+    mesh: Mesh,
+    topology: Topology,
+    scheme: Monotone | Polynomial,
+    is_near_fold: np.ndarray,
+    on_crease: np.ndarray | None,
 ) -> tuple[Topology, _Chart | None]:
     """The topology with its intrinsic triangulation, and the charts; or no charts if all rows are laid out in space.
 
-    The intrinsic `Monotone` lays out all rows in charts except those at folded faces; `Polynomial` lays out only the
-    rows at creases in charts.
+    The intrinsic `Monotone` lays out all rows in charts except those at or beside folded faces; `Polynomial` lays out
+    only the rows at creases in charts.
     """
     if on_crease is None or (isinstance(scheme, Polynomial) and not on_crease.any()):
         return topology, None
     triangulation, half_edges, angles = delaunay_triangulation(
-        mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks, is_folded
+        mesh.faces, mesh.vertices, topology.ring, topology.ring_blocks, is_near_fold
     )
     chart_directions = directions(angles, triangulation, topology.kinds)
     charts = Charts(
         triangulation.tails,
         topology.kinds,
         chart_directions,
-        _surrounded(topology.ring, is_folded),
-        support.LARGEST_FIT[scheme.degree],
+        _surrounded(topology.ring, is_near_fold),
+        longest_path_of(scheme),
     )
-    is_extrinsic = is_folded if isinstance(scheme, Monotone) else np.ones_like(is_folded)
+    is_extrinsic = is_near_fold if isinstance(scheme, Monotone) else np.ones_like(is_near_fold)
     topology = dataclasses.replace(
         topology, triangulation=triangulation, is_extrinsic=is_extrinsic if is_extrinsic.any() else None
     )
@@ -227,73 +233,80 @@ def _singular_corners(kinds: np.ndarray, angle_sums: np.ndarray, one_ring: suppo
     return is_singular | (is_corner & _meets(one_ring, is_singular))
 
 
-def _is_uneven(around: Neighbourhood) -> np.ndarray:
+def _is_uneven(one_rings: Neighbourhood) -> np.ndarray:
     """Whether the edge lengths at each vertex differ too much for a fit in double precision, (V,) bool."""
-    squared = np.sum(around.lifted**2, axis=1)
-    shortest, longest = (reduce.reduceat(squared, around.offsets[:-1]) for reduce in (np.minimum, np.maximum))
+    squared = np.sum(one_rings.lifted**2, axis=1)
+    shortest, longest = (reduce.reduceat(squared, one_rings.offsets[:-1]) for reduce in (np.minimum, np.maximum))
     return shortest * _LARGEST_RATIO**2 < longest
 
 
 def reach_along(
-    rings: OneRings, places: Places, charts: Charts | None, is_extrinsic: np.ndarray | None
+    rings: OneRings, layout: Places, charts: Charts | None, is_extrinsic: np.ndarray | None
 ) -> support.Reach:
     """A function that finds the neighbours within a few edges of given vertices and lays them out.
 
     They are laid out in charts; without charts, and for the vertices marked in ``is_extrinsic``, in space.
     """
 
-    def around(which: np.ndarray, rings_wide: int) -> tuple[np.ndarray, np.ndarray]:
-        return k_ring(rings, len(places.vertices), which, rings_wide)
+    def k_ring_of(which: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        return k_ring(rings, len(layout.vertices), which, k)
 
-    if charts is None or places.directions is None:
-        return support.reach_in_space(places.vertices, places.frames, places.lift, around)
-    no_half_edge = places.directions.no_half_edge
+    if charts is None or layout.directions is None:
+        return support.reach_in_space(layout.vertices, layout.frames, layout.lift, k_ring_of)
+    no_half_edge = layout.directions.no_half_edge
     in_space = support.reach_in_space(
-        places.vertices, places.frames, places.lift, around, charts.longest_path, no_half_edge
+        layout.vertices, layout.frames, layout.lift, k_ring_of, charts.longest_path, no_half_edge
     )
     return support.reach_in_charts(charts, in_space, is_extrinsic)
 
 
-def charts_of(scheme: Scheme, topology: Topology, places: Places) -> Charts | None:
+def charts_of(scheme: Scheme, topology: Topology, layout: Places) -> Charts | None:
     """The charts of a surface (host); None if all rows are laid out in space."""
-    if topology.triangulation is None or places.directions is None:
+    if topology.triangulation is None or layout.directions is None:
         return None
-    is_closed = np.zeros(len(topology.kinds), bool)
+    is_closed_to_paths = np.zeros(len(topology.kinds), bool)
     if isinstance(scheme, Monotone) and topology.is_extrinsic is not None:
-        is_closed = _surrounded(topology.ring, np.asarray(topology.is_extrinsic))
-    longest = support.LARGEST_FIT.get(getattr(scheme, "degree", 2), support.LARGEST_RING)
-    return Charts(topology.triangulation.tails, topology.kinds, places.directions, is_closed, longest)
+        is_closed_to_paths = _surrounded(topology.ring, np.asarray(topology.is_extrinsic))
+    tails = topology.triangulation.tails
+    return Charts(tails, topology.kinds, layout.directions, is_closed_to_paths, longest_path_of(scheme))
 
 
-def _surrounded(ring: Table, is_folded: np.ndarray) -> np.ndarray:
+def longest_path_of(scheme: Scheme) -> int:
+    """The largest number of half-edges in a path, which is the largest number of rings of a fit."""
+    return support.LARGEST_RING if isinstance(scheme, Paper) else support.LARGEST_FIT[scheme.degree]
+
+
+def _surrounded(ring: Table, is_marked: np.ndarray) -> np.ndarray:
     """Whether each vertex and all of its neighbours are marked, (V,) bool.
 
-    If corners of folded faces and their neighbours are marked, the result contains all such corners. No path may lead
-    through these vertices.
+    For the mask of `at_folded_faces`, which also marks the neighbours of the corners, the result contains every corner
+    of a folded face. `Charts` sends no path through these vertices.
     """
-    return is_folded & ring.map(lambda block: block.neighbours(is_folded).all(axis=0))
+    return is_marked & ring.map(lambda block: block.neighbours(is_marked).all(axis=0))
 
 
 def _table_of(name: str, rows: support.Rows, topology: Topology, chart: _Chart | None) -> dict[str, Any]:
     """The table of rows and their paths (None if they are laid out in space), as fields of a `Topology`."""
     table, paths = build_table(rows.offsets, rows.members), None
     if chart is not None:
-        none = chart.directions.no_half_edge
-        paths = block_paths(table, rows.offsets, rows.paths, none, topology.is_extrinsic)
+        no_half_edge = chart.directions.no_half_edge
+        paths = block_paths(table, rows.offsets, rows.paths, no_half_edge, topology.is_extrinsic)
     return {name: table, f"{name}_paths": paths}
 
 
 def _cotangent_rows(topology: Topology, is_cotangent: np.ndarray, chart: _Chart) -> tuple[CotangentRows, ...]:
     """The rows of the marked vertices, for each block of the Laplacian's table."""
-    none = chart.directions.no_half_edge
+    no_half_edge = chart.directions.no_half_edge
+    no_edge = no_half_edge >> 1
     blocks = []
     assert topology.diffusion is not None
     assert topology.diffusion_paths is not None
     for block, paths in zip(topology.diffusion.blocks, topology.diffusion_paths, strict=True):
-        columns = np.flatnonzero(block.centre(is_cotangent) & (paths.first != none).any(axis=0))
+        columns = np.flatnonzero(block.centre(is_cotangent) & (paths.first != no_half_edge).any(axis=0))
         half_edges = paths.first[:, columns]
-        edges = opposite_edges(chart.half_edges, np.minimum(half_edges, none - 1), none >> 1)
-        edges = np.where(half_edges == none, none >> 1, edges)
+        # Half-edge h belongs to edge h >> 1. Clip, so that padding does not read out of range.
+        edges = opposite_edges(chart.half_edges, np.minimum(half_edges, no_half_edge - 1), no_edge)
+        edges = np.where(half_edges == no_half_edge, no_edge, edges)
         blocks.append(CotangentRows(columns.astype(np.int32), edges.astype(np.int32)))
     return tuple(blocks)
 

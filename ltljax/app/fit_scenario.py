@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.folder import Folder
+from .._base.owned_folder import Folder
 from .._fit import Experiment, Fit, Observations, Positive, Real, fit, observe_at, observe_patches
 from .._solve.restart import RestartError
 from .._surface import Surface

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.folder import Folder, OutputError, copies
+from .._base.owned_folder import Folder, OutputError, copies
 from .._base.progress import noted, watched
 from .._mesh import Mesh
 from .._operators import integrate

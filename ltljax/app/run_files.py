@@ -18,7 +18,7 @@ _LARGE_VIEWER = 15_000_000
 
 
 def result_names(scenario: Scenario) -> list[str]:
-    """The names of all files that a run may write."""
+    """The names of all files that a run may write. `Folder.check` refuses those that ltljax did not write."""
     name = scenario.name
     names = [f"{name}.{ending}" for ending in ("html", "pvd", "ply", "glb", "png", "mp4", "gif")]
     names += [f"textured/{name}.{ending}" for ending in ("obj", "mtl", "png")]

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from ..._surface import Surface, on_surface
-from ..._tables import AnyArray
-from ..._tables.table import take
+from ..._tables import AnyArray, take
 from .noise import SolidNoise, solid_noise
 from .tracing import Points, checked_points, mean_edge, most_crossings, positions, tangent_field
 from .views import View, look
@@ -122,19 +121,19 @@ def _convolved(
     smallest = 1e-6 * length
     total, weight = smallest * sample(face, weights), jnp.full(face.shape, smallest)
 
-    def walk_one_side(carry, sense):
+    def walk_one_side(carry, sign):
         def segment(carry, _):
             def walk_on(carry):
                 walkers, total, weight, distance = carry
-                room = jnp.minimum(step, length - distance)
-                walkers, walked, midpoints = walk(faces, walkers, room, sense, is_directed)
+                max_length = jnp.minimum(step, length - distance)
+                walkers, walked, midpoints = walk(faces, walkers, max_length, sign, is_directed)
                 added = walked * _window((distance + walked / 2) / length, window)
                 return walkers, total + added * sample(*midpoints), weight + added, distance + walked
 
-            is_unfinished = jnp.any(carry[0].walks & (carry[3] < length))
+            is_unfinished = jnp.any(carry[0].is_walking & (carry[3] < length))
             return jax.lax.cond(is_unfinished, walk_on, lambda carry: carry, carry), None
 
-        walkers: Walkers = start(faces, face, weights, sense)
+        walkers: Walkers = start(faces, face, weights, sign)
         carry = (walkers, *carry, jnp.zeros_like(weight))
         (_, total, summed, _), _ = jax.lax.scan(segment, carry, length=segments)
         return (total, summed), None

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._tables.table import take
+from ..._tables import take
 
 # Grains after which the noise repeats.
 _PERIOD = 128

@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._operators import check_tangent
 from ..._surface import Surface, on_surface
-from ..._tables import AnyArray
-from ..._tables.table import take
+from ..._tables import AnyArray, take
 from .walking import CORNERS, faces_along, start, walk
 
 # Extra edges that a line may cross in one step, around a vertex or where faces are small.
@@ -98,17 +97,18 @@ def _streamlines(
     def advance(walkers, _):
         def segment(carry, _):
             def walk_on(carry):
-                walkers, room = carry
-                walkers, length, _ = walk(faces, walkers, room, 1.0, is_directed)
-                return walkers, jnp.where(walkers.walks, room - length, room)
+                walkers, remaining = carry
+                walkers, length, _ = walk(faces, walkers, remaining, 1.0, is_directed)
+                return walkers, jnp.where(walkers.is_walking, remaining - length, remaining)
 
-            walkers, room = carry
-            return jax.lax.cond(jnp.any(walkers.walks & (room > 0)), walk_on, lambda carry: carry, carry), None
+            walkers, remaining = carry
+            is_unfinished = jnp.any(walkers.is_walking & (remaining > 0))
+            return jax.lax.cond(is_unfinished, walk_on, lambda carry: carry, carry), None
 
         full = jnp.full(walkers.face.shape, step)
-        (walkers, room), _ = jax.lax.scan(segment, (walkers, full), length=segments)
-        arrived = walkers.walks & (room <= 0)
-        walkers = eqx.tree_at(lambda w: w.walks, walkers, arrived)
+        (walkers, remaining), _ = jax.lax.scan(segment, (walkers, full), length=segments)
+        arrived = walkers.is_walking & (remaining <= 0)
+        walkers = eqx.tree_at(lambda w: w.is_walking, walkers, arrived)
         return walkers, (positions(surface, walkers.face, walkers.weights), arrived)
 
     walkers = start(faces, face, weights, 1.0)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._surface import Surface
-from ..._tables.table import take
+from ..._tables import take
 
 # Vectors shorter than this, relative to the longest one, count as zeros of the field.
 VANISHES = 1e-6
@@ -27,15 +27,16 @@ class WalkFaces(eqx.Module):
     Attributes:
         rates: (F, 3, 3) rate of change of the weight of corner i along the vector at corner k, at [face, k, i].
         squares: (F, 3) squared length of edge i.
-        behind: (F, 3) index 3 g + j of the neighbour across edge i: its face g, and its corner j opposite the edge. On
-            a boundary, the index 3 f + i of the edge itself.
-        apexes: (F, 3, 3) weights in this face of the corner j, with the face g unfolded into the plane of this face.
+        opposite_slot: (F, 3) index 3 g + j: corner j of the neighbouring face g, opposite the shared edge i. On a
+            boundary, the index 3 f + i of corner i of this face f.
+        unfolded_opposite: (F, 3, 3) weights of that corner in this face, at [face, i], when face g is unfolded into the
+            plane of this face.
     """
 
     rates: Float[Array, "F 3 3"]
     squares: Float[Array, "F 3"]
-    behind: Int[Array, "F 3"]
-    apexes: Float[Array, "F 3 3"]
+    opposite_slot: Int[Array, "F 3"]
+    unfolded_opposite: Float[Array, "F 3 3"]
 
 
 class Walkers(eqx.Module):
@@ -46,14 +47,14 @@ class Walkers(eqx.Module):
         weights: (N, 3) barycentric weights.
         heading: (N, 3) rates of the weights along the last segment.
         entered: (N,) edge through which the walker entered the face, or 3.
-        walks: (N,) False once the walker has reached a boundary or a zero of the field.
+        is_walking: (N,) False once the walker has reached a boundary or a zero of the field.
     """
 
     face: Int[Array, " N"]
     weights: Float[Array, "N 3"]
     heading: Float[Array, "N 3"]
     entered: Int[Array, " N"]
-    walks: Bool[Array, " N"]
+    is_walking: Bool[Array, " N"]
 
 
 def faces_along(surface: Surface, X: Float[Array, "V 3"]) -> WalkFaces:
@@ -68,32 +69,32 @@ def faces_along(surface: Surface, X: Float[Array, "V 3"]) -> WalkFaces:
     normals = cross / doubled_areas[:, None]
     slopes = jnp.cross(normals[:, None], edges) / doubled_areas[:, None, None]
     squares = jnp.sum(edges**2, axis=2)
-    behind = _behind(faces)
-    # Positions along edge i, from corner i + 1, of the feet of the opposite corners on its two sides.
+    opposite_slot = _opposite_slots(faces)
+    # Feet of the perpendiculars to edge i from the two opposite corners, as fractions of the edge from corner i + 1.
     feet = jnp.sum((corners - jnp.roll(corners, -1, axis=1)) * edges, axis=2) / squares
-    opposite = corners.reshape(-1, 3)[behind]
+    opposite = corners.reshape(-1, 3)[opposite_slot]
     other_feet = jnp.sum((opposite - jnp.roll(corners, -1, axis=1)) * edges, axis=2) / squares
-    first = -doubled_areas[behind // 3] / doubled_areas[:, None]
+    first = -doubled_areas[opposite_slot // 3] / doubled_areas[:, None]
     third = other_feet - first * feet
     by_offset = jnp.stack([first, 1 - first - third, third], axis=2)
     offsets = (CORNERS[0][None, :] - CORNERS[0][:, None]) % 3
-    apexes = jnp.take_along_axis(by_offset, jnp.broadcast_to(offsets[None], by_offset.shape), axis=2)
-    return WalkFaces(jnp.einsum("fic,fkc->fki", slopes, take(X, faces)), squares, behind, apexes)
+    unfolded = jnp.take_along_axis(by_offset, jnp.broadcast_to(offsets[None], by_offset.shape), axis=2)
+    return WalkFaces(jnp.einsum("fic,fkc->fki", slopes, take(X, faces)), squares, opposite_slot, unfolded)
 
 
-def start(faces: WalkFaces, face: Array, weights: Array, sense: float | Array) -> Walkers:
-    """Walkers at points of faces, which will follow the field (sense 1) or go against it (-1)."""
+def start(faces: WalkFaces, face: Array, weights: Array, sign: float | Array) -> Walkers:
+    """Walkers at points of faces, which will follow the field (sign 1) or go against it (-1)."""
     nearest = jnp.argmax(weights, axis=1)
-    heading = sense * faces.rates[face, nearest]
-    # Walkers start off vertices and edges, so each leaves its face through the interior of one edge.
+    heading = sign * faces.rates[face, nearest]
+    # Move starting points off vertices and edges, so that each walker leaves its face through the interior of an edge.
     weights = _inside(weights, jnp.full(face.shape, 3, jnp.int32))
     return Walkers(face, weights, heading, jnp.full(face.shape, 3, jnp.int32), jnp.ones(face.shape, bool))
 
 
 def walk(
-    faces: WalkFaces, walkers: Walkers, room: Array, sense: float | Array, is_directed: bool
+    faces: WalkFaces, walkers: Walkers, max_length: Array, sign: float | Array, is_directed: bool
 ) -> tuple[Walkers, Array, tuple[Array, Array]]:
-    """One straight segment of each walker inside its face, by the midpoint rule, of at most the length ``room``.
+    """One straight segment of each walker inside its face, by the midpoint rule, of at most ``max_length``.
 
     Returns:
         The walkers after the segment, the lengths they went, and the faces and weights of the segments' midpoints.
@@ -107,26 +108,26 @@ def walk(
         if not is_directed:
             is_opposite = _product(vectors, heading[:, None], squares[:, None]) < 0
             vectors = jnp.where(is_opposite[:, :, None], -vectors, vectors)
-        direction = jnp.sum(weights[:, :, None] * vectors, axis=1) * (sense if is_directed else 1.0)
+        direction = jnp.sum(weights[:, :, None] * vectors, axis=1) * (sign if is_directed else 1.0)
         direction = _kept_inside(direction, squares, walkers.entered)
         squared = _product(direction, direction, squares)
         is_nonzero = squared > VANISHES**2
         return direction / jnp.sqrt(jnp.where(is_nonzero, squared, 1))[:, None], is_nonzero
 
-    direction, starts = direction_at(weights, walkers.heading)
+    direction, has_direction_at_start = direction_at(weights, walkers.heading)
     nearest = jnp.min(_distances(weights, direction, walkers.entered), axis=1)
-    half = jnp.minimum(room, nearest)[:, None] / 2
-    direction, continues = direction_at(weights + half * direction, direction)
+    half = jnp.minimum(max_length, nearest)[:, None] / 2
+    direction, has_direction_at_midpoint = direction_at(weights + half * direction, direction)
     distances = _distances(weights, direction, walkers.entered)
     edge = jnp.argmin(distances, axis=1).astype(jnp.int32)
     nearest = jnp.min(distances, axis=1)
-    has_direction = walkers.walks & starts & continues
-    moves = has_direction & (room > 0)
-    length = jnp.where(moves, jnp.minimum(room, nearest), 0)
+    has_direction = walkers.is_walking & has_direction_at_start & has_direction_at_midpoint
+    moves = has_direction & (max_length > 0)
+    length = jnp.where(moves, jnp.minimum(max_length, nearest), 0)
     end = jnp.maximum(weights + length[:, None] * direction, 0)
 
-    reaches_edge = moves & (nearest <= room)
-    slot = jnp.take_along_axis(faces.behind[face], edge[:, None], axis=1)[:, 0]
+    reaches_edge = moves & (nearest <= max_length)
+    slot = jnp.take_along_axis(faces.opposite_slot[face], edge[:, None], axis=1)[:, 0]
     is_boundary = slot == 3 * face + edge
     crosses = reaches_edge & ~is_boundary
     on_edge = jnp.where(reaches_edge[:, None] & (edge[:, None] == CORNERS), 0, end)
@@ -139,7 +140,7 @@ def walk(
         jnp.where(moves[:, None], next_weights, weights),
         jnp.where(moves[:, None], next_heading, walkers.heading),
         jnp.where(crosses, slot % 3, jnp.where(moves, 3, walkers.entered)),
-        (has_direction & ~(reaches_edge & is_boundary)) | (walkers.walks & (room <= 0)),
+        (has_direction & ~(reaches_edge & is_boundary)) | (walkers.is_walking & (max_length <= 0)),
     )
     return moved, length, (face, (weights + end) / 2)
 
@@ -149,21 +150,21 @@ def _across(
 ) -> tuple[Array, Array]:
     """Weights and direction in the corners of the neighbouring face, whose corner j is opposite the edge crossed.
 
-    The direction is unfolded if the field has no sign, and otherwise not needed.
+    For a field without sign, the direction is unfolded into the next face. A directed field does not use it.
     """
     order = (edge[:, None] + j[:, None] - CORNERS) % 3
     next_weights = _inside(jnp.take_along_axis(weights, order, axis=1), j)
     if is_directed:
         return next_weights, direction
-    apex = jnp.take_along_axis(faces.apexes[face, edge], order, axis=1)
+    opposite = jnp.take_along_axis(faces.unfolded_opposite[face, edge], order, axis=1)
     permuted = jnp.take_along_axis(direction, order, axis=1)
     is_j = j[:, None] == CORNERS
-    rate_of_j = jnp.sum(jnp.where(is_j, permuted / apex, 0), axis=1, keepdims=True)
-    return next_weights, jnp.where(is_j, rate_of_j, permuted - rate_of_j * apex)
+    rate_of_j = jnp.sum(jnp.where(is_j, permuted / opposite, 0), axis=1, keepdims=True)
+    return next_weights, jnp.where(is_j, rate_of_j, permuted - rate_of_j * opposite)
 
 
-def _behind(faces: Array) -> Int[Array, "F 3"]:
-    """The neighbour across each edge, as in `WalkFaces.behind`."""
+def _opposite_slots(faces: Array) -> Int[Array, "F 3"]:
+    """The corner opposite each edge in the neighbouring face, as in `WalkFaces.opposite_slot`."""
     first, second = jnp.roll(faces, -1, axis=1).reshape(-1), jnp.roll(faces, -2, axis=1).reshape(-1)
     low, high = jnp.minimum(first, second), jnp.maximum(first, second)
     order = jnp.lexsort((high, low)).astype(jnp.int32)
@@ -184,7 +185,7 @@ def _product(p: Array, q: Array, squares: Array) -> Array:
 def _kept_inside(direction: Array, squares: Array, entered: Array) -> Array:
     """The direction; if it points back across the edge just crossed, its part along that edge.
 
-    It points back where the field leads to the edge from both sides.
+    This happens where the fields of both faces point towards the edge.
     """
     order = (entered[:, None] + CORNERS) % 3
     inwards, _, second = (jnp.take_along_axis(direction, order[:, k : k + 1], axis=1)[:, 0] for k in range(3))

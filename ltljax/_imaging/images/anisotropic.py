@@ -17,8 +17,8 @@ from ..._equations import Equation
 from ..._operators import EllipticStencil, divergence, elliptic_stencil, gradient
 from ..._surface import Surface, on_device, on_surface
 from ..._tables import AnyArray
+from .checks import number, signal
 from .diffusion import evolved, local_mean
-from .signals import number, signal
 
 # Weickert's constant, for which the flux increases with the slope up to the contrast and decreases beyond it.
 _STEEPNESS = 3.31488

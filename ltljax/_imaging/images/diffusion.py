@@ -20,7 +20,7 @@ from ..._solve.krylov import Jacobi, linear_solve
 from ..._solve.stabilised import RKL1
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
-from .signals import check, number, signal
+from .checks import check, number, signal
 
 _EXACT = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 _MAX_ITERATIONS = 1000

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from ..._base.deprecated import renamed_arguments
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
+from .checks import check, number, signal
 from .diffusion import implicit_step
-from .signals import check, number, signal
-from .variation import denoise
+from .total_variation import denoise
 
 # Tolerance of the length of a unit vector.
 _UNIT = {jnp.dtype("float64"): 1e-6, jnp.dtype("float32"): 1e-4}

@@ -19,10 +19,10 @@ from ..._solve.direct import Factorized, factorized
 from ..._solve.poisson_equation import poisson
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
+from .checks import check, missing, signal
 from .conjugate_gradients import SplitPreconditioner, conjugate_gradients
 from .minimiser import Functional, HatGradients, minimise
-from .signals import check, missing, signal
-from .variation import deviation, flatness
+from .total_variation import deviation, flatness
 
 _EXACT = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-4}
 # A biharmonic residual up to this many times the tolerance is accepted if the iteration stalls.

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from ..._base.deprecated import renamed_arguments
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
+from .checks import number, same_shape, signal
 from .diffusion import local_mean
-from .signals import number, same_shape, signal
 
 # The constants of Wang et al.: the standard deviation of the window in pixels, and two that bound the denominators.
 _SCALE = 1.5

@@ -18,7 +18,7 @@ from ..._operators import laplacian
 from ..._solve.krylov import Jacobi, linear_solve
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
-from .signals import check, number, signal
+from .checks import check, number, signal
 
 # Relative residual tolerance of each step; the right-hand side itself becomes small near the end.
 _STEP_RTOL = 1e-4

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 
 from ..._base.deprecated import deprecated_alias
 from ..._surface import Surface, on_surface
-from ..._tables import AnyArray, Table, build_table, difference_sum, differences, reversible, slot_sum
-from ..._tables.table import take
+from ..._tables import AnyArray, Table, build_table, difference_sum, differences, reversible, slot_sum, take
 
 
 @on_surface

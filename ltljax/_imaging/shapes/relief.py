@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..._operators import curvature, gradient, hessian
 from ..._surface import Surface, on_device, on_surface
 from ..._tables import AnyArray
-from ..images.signals import number
+from ..images.checks import number
 
 
 class Ridges(eqx.Module):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import imaging
-from ..._imaging.images.variation import deviation
+from ..._imaging.images.total_variation import deviation
 from ..._mesh.columns import DataError, colors_of, from_zero_to_one, read_colors, read_columns
 from ..._operators import gradient
 from ..choices import DENOISING_METHODS

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.folder import Folder
+from ..._base.owned_folder import Folder
 from ..record import NO_PICTURES, print_measured
 from .subject import Subject
 

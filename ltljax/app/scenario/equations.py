@@ -33,9 +33,9 @@ KINETICS: dict[str, Callable[..., kinetics.Kinetics]] = {
 _CURVATURE_FIELDS = {"greatest-curvature": True, "least-curvature": False}
 _MOST_SPECIES = 64
 
-# Values that replace numbers of the file, by dotted key: the unknowns of a fit.
-_Free = Mapping[str, Any]
-_NONE_FREE: _Free = MappingProxyType({})
+# Numbers that replace those of the file, by dotted key. In a fit they are the unknowns.
+_Overrides = Mapping[str, Any]
+_NO_OVERRIDES: _Overrides = MappingProxyType({})
 _Conditions = tuple[Neumann | Dirichlet | Robin, ...]
 
 
@@ -44,7 +44,8 @@ class ScenarioEquation:
     """The equation of a scenario.
 
     Attributes:
-        make: ``surface -> equation``; a second argument replaces numbers of the file, by dotted key.
+        make: ``(surface, overrides) -> equation``. The overrides are numbers that replace those of the file, by dotted
+            key; none by default.
         species: names of the species.
         numbers: numbers of the file that may be unknowns of a fit, by dotted key.
         notes: what a reader of the results should know.
@@ -61,13 +62,14 @@ class _Reaction:
     """What acts at a point, beside diffusion.
 
     Attributes:
-        join: ``(surface, spreads, conditions, free) -> equation``.
+        make_equation: ``(surface, diffusions, conditions, overrides) -> equation``, with a diffusivity or an operator
+            for each species.
         species: names of the species.
         numbers: numbers that may be unknowns of a fit, by dotted key.
         is_balanced: whether the mean of a source is subtracted.
     """
 
-    join: Callable[[Surface, list[Any], _Conditions, _Free], Equation]
+    make_equation: Callable[[Surface, list[Any], _Conditions, _Overrides], Equation]
     species: tuple[str, ...]
     numbers: dict[str, float]
     is_balanced: bool = False
@@ -95,14 +97,15 @@ def read_equation(root: Table, mesh: Mesh, fields: Fields, scale: float) -> Scen
     direction, flow = _direction(root.table("direction"), fields, species), _flow(root.table("flow"), fields, scale)
     conditions = _conditions(root.table("boundary"), mesh)
 
-    def make(surface: Surface, free: _Free = _NONE_FREE) -> Equation:
-        spreads = [
-            _spread(surface, scale**2 * free.get(f"diffusivity.{s}", d), direction.get(s), flow)
+    def make(surface: Surface, overrides: _Overrides = _NO_OVERRIDES) -> Equation:
+        diffusions = [
+            _diffusion(surface, scale**2 * overrides.get(f"diffusivity.{s}", d), direction.get(s), flow)
             for s, d in zip(species, diffusivities, strict=True)
         ]
-        return reaction.join(surface, spreads, conditions, free)
+        return reaction.make_equation(surface, diffusions, conditions, overrides)
 
-    # The operators of directions and flows choose their neighbours on the host, and the diffusivity affects the choice.
+    # A diffusivity can be fitted only if it multiplies the Laplacian: with a direction or a flow, the host chooses the
+    # neighbours by it.
     plain = {s: d for s, d in zip(species, diffusivities, strict=True) if flow is None and s not in direction}
     notes = ("The mean of the source is subtracted, so that a stationary state exists.",)
     has_note = reaction.is_balanced and not conditions
@@ -113,7 +116,10 @@ def _reaction(root: Table, table: Table, fields: Fields) -> _Reaction:
     formulas = root.table("reactions")
     if formulas.names():
         if table.names():
-            raise root.error("kinetics", "either [kinetics] with a name or [reactions] with formulas, not both,")
+            raise root.refused(
+                "kinetics",
+                "There are both [kinetics] with a name and [reactions] with formulas. Leave one of them out.",
+            )
         return _written_reaction(formulas, root.table("parameters"), fields)
     if table.peek("name") == "turk":
         warn_deprecated('The scenario value kinetics.name = "turk"', '"turing"')
@@ -133,11 +139,13 @@ def _named_reaction(table: Table, name: str, fields: Fields) -> _Reaction:
     values = {key: fields.read(table, key, p.default) for key, p in inspect.signature(make).parameters.items()}
     table.finish()
 
-    def join(surface: Surface, spreads: list[Any], conditions: _Conditions, free: _Free) -> Equation:
-        parameters = {key: jnp.asarray(free.get(f"kinetics.{key}", v), surface.dtype) for key, v in values.items()}
-        return ReactionDiffusion(spreads, make(**parameters), boundary=conditions)
+    def make_equation(
+        surface: Surface, diffusions: list[Any], conditions: _Conditions, overrides: _Overrides
+    ) -> Equation:
+        parameters = {key: jnp.asarray(overrides.get(f"kinetics.{key}", v), surface.dtype) for key, v in values.items()}
+        return ReactionDiffusion(diffusions, make(**parameters), boundary=conditions)
 
-    return _Reaction(join, make().species, _numbers("kinetics", values))
+    return _Reaction(make_equation, make().species, _numbers("kinetics", values))
 
 
 class _WrittenRates(eqx.Module):
@@ -155,38 +163,48 @@ def _written_reaction(table: Table, parameters: Table, fields: Fields) -> _React
     rates, names = table.names(), parameters.names()
     for key in rates:
         if not (key.startswith("d") and key[1:].isidentifier()):
-            raise table.error(key, "the rate of a species, such as du or dv,")
+            raise table.refused(key, "This is not the rate of a species. Name rates like du or dv.")
     species = tuple(key[1:] for key in rates)
     if len(species) > _MOST_SPECIES:
-        raise table.error(rates[-1], f"at most {_MOST_SPECIES} species; without this one")
+        raise table.refused(rates[-1], f"There are more than {_MOST_SPECIES} species. Remove this one.")
     for name in names:
         if name in species or not name.isidentifier():
-            raise parameters.error(name, "a name that is not a species")
+            raise parameters.refused(name, "This is the name of a species, or not a valid name. Choose another one.")
     written = _WrittenRates(tuple(table.formula(key, (*species, *names)) for key in rates), species)
     values = {name: fields.read(parameters, name) for name in names}
 
-    def join(surface: Surface, spreads: list[Any], conditions: _Conditions, free: _Free) -> Equation:
-        params = {name: jnp.asarray(free.get(f"parameters.{name}", v), surface.dtype) for name, v in values.items()}
-        return ReactionDiffusion(spreads, kinetics.Kinetics(written, params, species), boundary=conditions)
+    def make_equation(
+        surface: Surface, diffusions: list[Any], conditions: _Conditions, overrides: _Overrides
+    ) -> Equation:
+        params = {
+            name: jnp.asarray(overrides.get(f"parameters.{name}", v), surface.dtype) for name, v in values.items()
+        }
+        return ReactionDiffusion(diffusions, kinetics.Kinetics(written, params, species), boundary=conditions)
 
-    return _Reaction(join, species, _numbers("parameters", values))
+    return _Reaction(make_equation, species, _numbers("parameters", values))
 
 
 def _heat(table: Table, fields: Fields) -> _Reaction:
-    """du/dt = d Laplacian(u) + source. A balanced source loses its mean unless the boundary has conditions."""
+    """du/dt = d Laplacian(u) + source.
+
+    If ``balanced``, the mean of the source is subtracted, unless there are boundary conditions.
+    """
     source, is_balanced = fields.read(table, "source", 0.0), table.flag("balanced", False)
     table.finish()
 
-    def join(surface: Surface, spreads: list[Any], conditions: _Conditions, free: _Free) -> Equation:
-        g = jnp.asarray(free.get("kinetics.source", source), surface.dtype)
+    def make_equation(
+        surface: Surface, diffusions: list[Any], conditions: _Conditions, overrides: _Overrides
+    ) -> Equation:
+        g = jnp.asarray(overrides.get("kinetics.source", source), surface.dtype)
         g = jnp.broadcast_to(g, surface.vertices.shape[:1])
         if is_balanced and not conditions:
-            # Diffusion conserves the mean in this measure; in any other one a small mean would remain and accumulate.
+            # Diffusion conserves the mean in this measure. In any other measure, a small mean would remain and
+            # accumulate.
             measure = surface.mass if isinstance(surface.scheme, Monotone) else surface.vertex_areas
             g = g - integrate(surface, g, measure) / jnp.sum(measure)
-        return Diffusion(tuple(spreads), g[:, None], conditions)
+        return Diffusion(tuple(diffusions), g[:, None], conditions)
 
-    return _Reaction(join, ("u",), _numbers("kinetics", {"source": source}), is_balanced)
+    return _Reaction(make_equation, ("u",), _numbers("kinetics", {"source": source}), is_balanced)
 
 
 def _cahn_hilliard(table: Table, scale: float) -> ScenarioEquation:
@@ -194,8 +212,8 @@ def _cahn_hilliard(table: Table, scale: float) -> ScenarioEquation:
     table.choice("name", ("cahn-hilliard",))
     table.finish()
 
-    def make(surface: Surface, free: _Free = _NONE_FREE) -> Equation:
-        width, mobility = (jnp.asarray(free.get(f"kinetics.{key}", v), surface.dtype) for key, v in values.items())
+    def make(surface: Surface, overrides: _Overrides = _NO_OVERRIDES) -> Equation:
+        width, mobility = (jnp.asarray(overrides.get(f"kinetics.{key}", v), surface.dtype) for key, v in values.items())
         return CahnHilliard(scale * width, scale**2 * mobility)
 
     return ScenarioEquation(make, ("u",), _numbers("kinetics", values))
@@ -271,7 +289,7 @@ def _direction(table: Table, fields: Fields, species: tuple[str, ...]) -> dict[s
     # If all species had a direction, the pattern would be stretched and would not align with it.
     directed = tuple(table.texts("species")) or species[:1]
     if unknown := [s for s in directed if s not in species]:
-        raise table.error("species", f"some of {', '.join(species)} without {unknown[0]!r}")
+        raise table.refused("species", f"{unknown[0]!r} is not a species. Name some of {', '.join(species)}.")
     table.finish()
     return dict.fromkeys(directed, (field, ratio))
 
@@ -279,7 +297,7 @@ def _direction(table: Table, fields: Fields, species: tuple[str, ...]) -> dict[s
 def _principal_direction(surface: Surface, is_largest: bool, smoothing: float) -> np.ndarray:
     """The direction of the largest or smallest curvature, averaged over a length."""
     bend = curvature(surface).shape_operator.reshape(-1, 9)
-    if smoothing:  # Directions of unsmoothed noise would be noise.
+    if smoothing:  # on a noisy mesh, directions without smoothing are noise
         bend = solve(Diffusion(), surface, bend, smoothing**2 / 4).u_end
     bend = np.asarray(bend, np.float64).reshape(-1, 3, 3)
     frames = np.asarray(surface.geometry.frames, np.float64)
@@ -297,7 +315,7 @@ def _flow(table: Table, fields: Fields, scale: float) -> np.ndarray | None:
     return scale * velocity
 
 
-def _spread(surface: Surface, diffusivity: Any, direction: _Direction | None, flow: np.ndarray | None) -> Any:
+def _diffusion(surface: Surface, diffusivity: Any, direction: _Direction | None, flow: np.ndarray | None) -> Any:
     """The diffusivity of a species, or its operator if the species has a direction or drifts with a flow."""
     if direction is None and flow is None:
         return diffusivity

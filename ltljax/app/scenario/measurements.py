@@ -147,7 +147,9 @@ def _free(table: Table, numbers: dict[str, float]) -> list[str]:
         if key not in numbers:
             raise table.error("free", f"some of {', '.join(numbers)} (numbers, not formulas of the position)")
         if numbers[key] <= 0:
-            raise table.error("free", f"numbers that are positive in this file: {key} is {numbers[key]:g}, but")
+            raise table.refused(
+                "free", f"Only positive numbers can be fitted, but {key} is {numbers[key]:g} in this file."
+            )
     return free
 
 

@@ -141,7 +141,7 @@ def read_freesurfer_fields(path: Path) -> dict[str, Any]:
     return {path.suffix.removeprefix("."): np.asarray(read_morph_data(path), np.float64)}
 
 
-READERS: dict[str, Callable[[Path], Any]] = {
+PACKAGE_READERS: dict[str, Callable[[Path], Any]] = {
     "meshio": lambda path: read_meshio(path)._asdict(),
     "vtk": lambda path: read_vtk(path)._asdict(),
     "gifti": lambda path: read_gifti(path)._asdict(),
@@ -216,7 +216,7 @@ def main(reader: str, path: Path, target: Path, memory: float, seconds: float) -
     with open(target, "wb") as file, open(target.with_suffix(".json"), "w", encoding="utf-8") as report_file:
         _forbid_other_files(path, [*packages, sys.prefix, sys.base_prefix])
         try:
-            arrays = READERS[reader](path)
+            arrays = PACKAGE_READERS[reader](path)
             report["names"] = list(arrays)
             np.savez(file, **{f"array_{index}": array for index, array in enumerate(arrays.values())})
         except Refused as error:

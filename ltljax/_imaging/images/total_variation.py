@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 from ..._base.deprecated import renamed_arguments
 from ..._surface import Surface, on_surface
 from ..._tables import AnyArray
+from .checks import check, number, signal
 from .minimiser import Functional, HatGradients, minimise
-from .signals import check, number, signal
 
 # Tolerance of Newton's last step, relative to the standard deviation of the image.
 _RTOL = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}

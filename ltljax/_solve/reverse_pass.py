@@ -3,10 +3,11 @@
 What enters: the states that a run kept at some of its steps, and the cotangents of its results. What leaves: the
 cotangents of its initial state and of what its rate depends on.
 
-The pass goes backwards from one kept state to the one before (a segment). The steps of a segment are taken again, and
-the states at which the rate was evaluated go onto the tape, so that each stage can be transposed without being computed
-a third time. If the tape is too short for a segment, the segment is transposed in blocks, from the end: for each block
-its first steps are taken again, and the tape keeps the states that were written last.
+The pass goes backwards from one kept state to the one before (a segment). The steps of a segment are repeated, and the
+states at which the rate is evaluated are written to the tape, so that each stage can be transposed without being
+computed a third time. If the tape is too short for a segment, the segment is transposed in blocks, the last one first.
+For each block, the steps from the start of the segment to the end of the block are repeated. The tape is a ring buffer
+and keeps the states written last.
 """
 
 import functools
@@ -102,8 +103,8 @@ class _Cotangents(NamedTuple):
         last: cotangent of the last increment.
         before: cotangent of the increment before.
         first_rate: cotangent of the rate at the start of the step.
-        start_by_rates: cotangent of the start of the step by way of the rates at its stages.
-        start: cotangent of the start of the step by all other ways.
+        start_by_rates: the part of the cotangent of the step's start that comes through the stage rates.
+        start: the remaining part of the cotangent of the step's start.
     """
 
     last: Array
@@ -117,8 +118,8 @@ class _Tape(NamedTuple):
     """The stage states of the last steps of a segment.
 
     Attributes:
-        states: (size, V, ...) stage states; number p of the segment lies at p modulo the size.
-        positions: (longest,) number of the first stage state of each step.
+        states: (size, V, ...) stage states; stage state p of the segment lies at p modulo the size.
+        positions: (longest,) index, within the segment, of the first stage state of each step, which is its start.
         extents: (longest, 2) spectral bound and width at the start of each step.
     """
 
@@ -128,7 +129,7 @@ class _Tape(NamedTuple):
 
 
 class _Replay(NamedTuple):
-    """The progress of taking steps again: index and initial state of the next step, and its position on the tape."""
+    """The progress of repeating steps: index, initial state and first stage state's index of the next step."""
 
     step: Array
     state: Array
@@ -137,7 +138,7 @@ class _Replay(NamedTuple):
 
 
 class _Segment(NamedTuple):
-    """The progress over segments: number of the next one, cotangents at its end, gradient, and room for the tape."""
+    """The progress over segments: index of the next one, cotangents at its end, gradient, and buffer of the tape."""
 
     number: Array
     cotangents: _Cotangents
@@ -150,10 +151,11 @@ class _Block(NamedTuple):
 
     Attributes:
         step: index of the next step to transpose.
-        stage: number of its stage states that remain; negative if all of them do.
-        cotangents: cotangents there.
+        stage: index, within the step, of the last stage state still to transpose (0 is the start of the step); -1 if
+            nothing of the segment has been transposed.
+        cotangents: cotangents within the step.
         gradient: gradient of the segment so far.
-        tape_states: room for the tape.
+        tape_states: buffer of the tape.
     """
 
     step: Array
@@ -164,7 +166,7 @@ class _Block(NamedTuple):
 
 
 class _Backward(NamedTuple):
-    """The progress within a block: index of the step, number of the next stage state on the tape, and cotangents."""
+    """The progress within a block: index of the step, index of the next stage state to transpose, and cotangents."""
 
     step: Array
     top: Array
@@ -214,20 +216,20 @@ def reverse(
         u_end: final state, needed if states were requested in the middle of steps.
     """
     parameters, constants = eqx.partition(rate, perturbed[1])
-    this = _Pass(run, parameters, constants, ct_us)
+    context = _Pass(run, parameters, constants, ct_us)
     gradient, zero = jax.tree.map(jnp.zeros_like, parameters), jnp.zeros_like(ct)
     if u_end is not None and ct_us is not None:
-        # No step follows whose start would account for the rate at the end.
-        _, first_rate, _ = _with_requests(this, run.num_steps, (zero, zero, zero), True)
-        pulled, gradient = _pull_back(this, run.num_steps - 1, run.times[run.num_steps], u_end, first_rate, gradient)
+        # The rate at the final state needs a separate transpose, because no further step begins there.
+        _, first_rate, _ = _with_requests(context, run.num_steps, (zero, zero, zero), True)
+        pulled, gradient = _pull_back(context, run.num_steps - 1, run.times[run.num_steps], u_end, first_rate, gradient)
         ct = ct + pulled
     last = eqxi.unvmap_max(run.num_steps)
     number = jnp.searchsorted(run.starts, last).astype(run.starts.dtype) - 1
     tape_states = jnp.zeros((run.size, *ct.shape), ct.dtype)
     end = jax.lax.while_loop(
         lambda segment: segment.number >= 0,
-        functools.partial(_transpose_segment, this),
-        _Segment(number, _at_end_of_step(this, last - 1, ct), gradient, tape_states),
+        functools.partial(_transpose_segment, context),
+        _Segment(number, _at_end_of_step(context, last - 1, ct), gradient, tape_states),
     )
     ct = end.cotangents.start
     if ct_us is not None:
@@ -237,28 +239,28 @@ def reverse(
 
 
 def _with_requests(
-    this: _Pass, k: Array, sums: tuple[Array, Array, Array], is_followed: Array | bool
+    context: _Pass, k: Array, sums: tuple[Array, Array, Array], is_followed: Array | bool
 ) -> tuple[Array, Array, Array]:
     """Cotangents with those of the states requested within step k and, if step k was taken, within step k - 1.
 
-    A requested state is a cubic in theta of the states and rates at both ends of its step. The weights of both states
-    sum to one, and what is due to the end of the step is passed on to its start. The rate at the end of step k - 1 is
-    the one at the start of step k.
+    A requested state is the cubic Hermite interpolant of its step. The end of a step is its start plus the last
+    increment, so the whole cotangent goes to the start, and the share theta^2 (3 - 2 theta) also to the last increment.
+    The rate at the end of step k - 1 is the rate at the start of step k, so its share is added with step k.
 
     Args:
-        this: the reverse pass.
+        context: the reverse pass.
         k: index of the step.
         sums: cotangents of the last increment, of the rate at the start, and of the start.
-        is_followed: whether the rate at the end of step k - 1 is accounted for here.
+        is_followed: whether the states requested within step k - 1 contribute to the rate at its end.
     """
-    if this.ct_us is None:
+    if context.ct_us is None:
         return sums
-    ct_us, (steps, thetas), times = this.ct_us, this.run.requests, this.run.times
+    ct_us, (steps, thetas), times = context.ct_us, context.run.requests, context.run.times
 
     def add(row, sums):
         last, first_rate, start = sums
         step, x = steps[row], thetas[row]
-        ct, is_within = jnp.where(step < this.run.num_steps, ct_us[row], 0), step == k
+        ct, is_within = jnp.where(step < context.run.num_steps, ct_us[row], 0), step == k
         weight = jnp.where(is_within, x * (1 - x) ** 2, jnp.where(is_followed, x**2 * (x - 1), 0))
         first_rate = first_rate + (times[step + 1] - times[step]) * weight * ct
         return (
@@ -271,28 +273,28 @@ def _with_requests(
     return jax.lax.fori_loop(jnp.maximum(first, jnp.searchsorted(steps, 0)), end, add, sums)
 
 
-def _at_end_of_step(this: _Pass, k: Array, ct: Array) -> _Cotangents:
+def _at_end_of_step(context: _Pass, k: Array, ct: Array) -> _Cotangents:
     """The cotangents within step k, before its last stage is transposed, from the cotangent of its end."""
-    is_taken, zero = k < this.run.num_steps, jnp.zeros_like(ct)
-    last, first_rate, start = _with_requests(this, k, (jnp.where(is_taken, ct, 0), zero, ct), is_taken)
+    is_taken, zero = k < context.run.num_steps, jnp.zeros_like(ct)
+    last, first_rate, start = _with_requests(context, k, (jnp.where(is_taken, ct, 0), zero, ct), is_taken)
     return _Cotangents(last, zero, first_rate, zero, start)
 
 
-def _pull_back(this: _Pass, k: Array, t: Array, u: Array, ct: Array, gradient: Any) -> tuple[Array, Any]:
-    """The cotangent of the state through the rate there, and the gradient with the contribution of that rate."""
-    _, transpose = jax.vjp(lambda parameters, u: this.rate(parameters, t, u), this.parameters, u)
-    # In a batch, a run that has ended may stand where the rate has no derivative.
-    added, pulled = jax.tree.map(lambda x: jnp.where(k < this.run.num_steps, x, 0), transpose(ct))
+def _pull_back(context: _Pass, k: Array, t: Array, u: Array, ct: Array, gradient: Any) -> tuple[Array, Any]:
+    """The cotangent that the rate at (t, u) passes to u, and the gradient with its contribution."""
+    _, transpose = jax.vjp(lambda parameters, u: context.rate(parameters, t, u), context.parameters, u)
+    # In a batch, the final state of a run that has ended may be one where the rate has no derivative.
+    added, pulled = jax.tree.map(lambda x: jnp.where(k < context.run.num_steps, x, 0), transpose(ct))
     return pulled, jax.tree.map(jnp.add, gradient, added)
 
 
-def _transpose_segment(this: _Pass, segment: _Segment) -> _Segment:
-    run, zero = this.run, jax.tree.map(jnp.zeros_like, this.parameters)
+def _transpose_segment(context: _Pass, segment: _Segment) -> _Segment:
+    run, zero = context.run, jax.tree.map(jnp.zeros_like, context.parameters)
     begin = run.starts[segment.number]
     last = jnp.minimum(run.starts[segment.number + 1], eqxi.unvmap_max(run.num_steps)) - 1
     end = jax.lax.while_loop(
         lambda block: block.step >= begin,
-        functools.partial(_transpose_block, this, segment.number),
+        functools.partial(_transpose_block, context, segment.number),
         _Block(last, -jnp.ones_like(last), segment.cotangents, zero, segment.tape_states),
     )
     # The gradient is a sum of sums, whose rounding does not grow with the number of stages.
@@ -300,46 +302,46 @@ def _transpose_segment(this: _Pass, segment: _Segment) -> _Segment:
     return _Segment(segment.number - 1, end.cotangents, gradient, end.tape_states)
 
 
-def _transpose_block(this: _Pass, number: Array, block: _Block) -> _Block:
-    """Transpose the last stages of what remains of a segment, as many as the tape holds."""
-    begin = this.run.starts[number]
-    top, tape = _replay(this, number, block)
-    # A step that ends at its start wrote one state more.
-    lowest = jnp.maximum(top - this.run.size + 2, 0)
+def _transpose_block(context: _Pass, number: Array, block: _Block) -> _Block:
+    """Transpose the last remaining stages of a segment, as many as the tape holds."""
+    begin = context.run.starts[number]
+    top, tape = _replay(context, number, block)
+    # If only the start of the last step remains, `increment` still writes stage 1, which overwrites one more row.
+    lowest = jnp.maximum(top - context.run.size + 2, 0)
     end = jax.lax.while_loop(
         lambda carry: carry.top >= lowest,
-        functools.partial(_transpose_step, this, tape, begin, lowest),
+        functools.partial(_transpose_step, context, tape, begin, lowest),
         _Backward(block.step, top, block.cotangents, block.gradient),
     )
-    # Number of remaining stage states of a step that was on the tape in part; the next step is still whole.
+    # Index, within its step, of the last stage state still to transpose.
     remaining = end.top - tape.positions[end.step - begin]
     stage = jnp.where((end.step >= begin) & (end.top >= tape.positions[end.step - begin]), remaining, -1)
     return _Block(end.step, stage, end.cotangents, end.gradient, tape.states)
 
 
-def _replay(this: _Pass, number: Array, block: _Block) -> tuple[Array, _Tape]:
-    """The number of the last stage state that remains of a segment, and the tape up to it."""
-    run, begin = this.run, this.run.starts[number]
+def _replay(context: _Pass, number: Array, block: _Block) -> tuple[Array, _Tape]:
+    """The index, within the segment, of the last stage state still to transpose, and the tape up to it."""
+    run, begin = context.run, context.run.starts[number]
     tape_states = jax.lax.dynamic_update_index_in_dim(block.tape_states, run.states[number], 0, 0)
     tape = _Tape(tape_states, jnp.zeros(run.longest, begin.dtype), jnp.zeros((run.longest, 2), run.times.dtype))
     end = jax.lax.while_loop(
         lambda replay: replay.step <= block.step,
-        functools.partial(_take_again, this, begin, block),
+        functools.partial(_repeat_step, context, begin, block),
         _Replay(begin, run.states[number], jnp.zeros_like(begin), tape),
     )
     return end.position, end.tape
 
 
-def _take_again(this: _Pass, begin: Array, block: _Block, replay: _Replay) -> _Replay:
-    """Take a step of a segment again, with its stage states written to the tape."""
-    run, (k, u, position, tape) = this.run, replay
-    rate, t = functools.partial(this.rate, this.parameters), run.times[k]
+def _repeat_step(context: _Pass, begin: Array, block: _Block, replay: _Replay) -> _Replay:
+    """Repeat a step of a segment and write its stage states to the tape."""
+    run, (k, u, position, tape) = context.run, replay
+    rate, t = functools.partial(context.rate, context.parameters), run.times[k]
     extent = run.rules.extent(t, u)
     positions, extents = tape.positions.at[k - begin].set(position), tape.extents.at[k - begin].set(extent)
     plan = run.rules.stepper.plan(extent, run.times[k + 1] - t)
     # Under vmap, use the largest number of stages among the runs that have not ended.
     stages = eqxi.unvmap_max(jnp.where(k < run.num_steps, plan.stages, FEWEST)).astype(k.dtype)
-    # The last increment of a step gives the first state of the next one, except for the last step.
+    # Every step but the last runs all its stages, because its end is the start of the next step.
     last_stage = jnp.where(block.stage < 0, stages - 1, block.stage)
     until = jnp.where(k < block.step, stages, last_stage)
 
@@ -351,20 +353,22 @@ def _take_again(this: _Pass, begin: Array, block: _Block, replay: _Replay) -> _R
     return _Replay(k + 1, u, position + until, _Tape(states, positions, extents))
 
 
-def _transpose_step(this: _Pass, tape: _Tape, begin: Array, lowest: Array, carry: _Backward) -> _Backward:
-    """Transpose the stages of a step that are on the tape, and its start if that is."""
-    t, position = this.run.times[carry.step], tape.positions[carry.step - begin]
-    plan = this.run.rules.stepper.plan(tape.extents[carry.step - begin], this.run.times[carry.step + 1] - t)
+def _transpose_step(context: _Pass, tape: _Tape, begin: Array, lowest: Array, carry: _Backward) -> _Backward:
+    """Transpose the stages of a step that are on the tape, and its start if it is on the tape."""
+    t, position = context.run.times[carry.step], tape.positions[carry.step - begin]
+    plan = context.run.rules.stepper.plan(tape.extents[carry.step - begin], context.run.times[carry.step + 1] - t)
     carry = jax.lax.while_loop(
         lambda carry: carry.top > jnp.maximum(position, lowest - 1),
-        functools.partial(_transpose_stage, this, tape, position, plan),
+        functools.partial(_transpose_stage, context, tape, position, plan),
         carry,
     )
     is_on_tape = (carry.top == position) & (carry.top >= lowest)
-    return jax.lax.cond(is_on_tape, functools.partial(_transpose_start, this, tape, plan), lambda carry: carry, carry)
+    return jax.lax.cond(
+        is_on_tape, functools.partial(_transpose_start, context, tape, plan), lambda carry: carry, carry
+    )
 
 
-def _transpose_stage(this: _Pass, tape: _Tape, position: Array, plan: Plan, carry: _Backward) -> _Backward:
+def _transpose_stage(context: _Pass, tape: _Tape, position: Array, plan: Plan, carry: _Backward) -> _Backward:
     """Transpose ``d_j = mu_j d_(j-1) + nu_j d_(j-2) + dt (mu'_j f(u + d_(j-1)) + gamma'_j f(u))``.
 
     The cotangent of increment j goes to the two increments before it, to the state u and to the rate there.
@@ -373,18 +377,20 @@ def _transpose_stage(this: _Pass, tape: _Tape, position: Array, plan: Plan, carr
     j = top - position + 1
     mu, nu, mu_rate, gamma_rate = plan.coefficients(j)
     ct_rate = plan.dt * mu_rate * ct.last
-    t = plan.time(this.run.times[k], j)
-    pulled, gradient = _pull_back(this, k, t, tape.states[top % this.run.size], ct_rate, gradient)
+    t = plan.time(context.run.times[k], j)
+    pulled, gradient = _pull_back(context, k, t, tape.states[top % context.run.size], ct_rate, gradient)
     first_rate = ct.first_rate + plan.dt * gamma_rate * ct.last
     ct = _Cotangents(ct.before + mu * ct.last + pulled, nu * ct.last, first_rate, ct.start_by_rates + pulled, ct.start)
     return _Backward(k, top - 1, ct, gradient)
 
 
-def _transpose_start(this: _Pass, tape: _Tape, plan: Plan, carry: _Backward) -> _Backward:
+def _transpose_start(context: _Pass, tape: _Tape, plan: Plan, carry: _Backward) -> _Backward:
     """Transpose the first increment and the rate at the start of a step, and go to the end of the step before."""
     k, top, ct, gradient = carry
     ct_rate = ct.first_rate + plan.first(ct.last)
-    pulled, gradient = _pull_back(this, k, this.run.times[k], tape.states[top % this.run.size], ct_rate, gradient)
+    pulled, gradient = _pull_back(
+        context, k, context.run.times[k], tape.states[top % context.run.size], ct_rate, gradient
+    )
     # The contributions of the rates are summed first: they are smaller than that of the state by the length of a step.
     start = ct.start + (ct.start_by_rates + pulled)
-    return _Backward(k - 1, top - 1, _at_end_of_step(this, k - 1, start), gradient)
+    return _Backward(k - 1, top - 1, _at_end_of_step(context, k - 1, start), gradient)
