@@ -215,7 +215,7 @@ BROKEN_FITS = {
         "finite values of u, or nan where nothing was measured: 42 are infinite",
     ),
     "no species": ("early.npz", "other.npz", "columns or arrays named u or v"),
-    "damaged": ("early.npz", "damaged.npz", "a sound file"),
+    "damaged": ("early.npz", "damaged.npz", "an intact file"),
     "vertex too large": ("early.npz", "far.csv", "vertices from 0 to 41, not 500"),
     "other species": ("late.npz", "only_u.npz", "of the first file"),
 }
