@@ -219,7 +219,7 @@ def test_a_state_that_does_not_fit_is_refused(sphere):
     with pytest.raises(ValueError, match=r"found \(7,\)"):
         ltl.solve(ltl.Diffusion(), sphere, jnp.zeros(7), 1.0)
     equation = ltl.ReactionDiffusion((1.0, 1.0), ltl.kinetics.gray_scott())
-    with pytest.raises(ValueError, match="one column for each diffusivity"):
+    with pytest.raises(ValueError, match="one column per diffusivity"):
         ltl.solve(equation, sphere, jnp.zeros((sphere.num_vertices, 3)), 1.0)
 
 

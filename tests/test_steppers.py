@@ -1,18 +1,14 @@
 """Steppers: order in time, stability, the maximum principle, and derivatives through all of them."""
 
-import dataclasses
-import functools
 import re
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 
 import ltljax as ltl
-from ltljax._base.arguments import as_numbers
 from ltljax._solve import preconditioning
 from ltljax._solve.checks import longest_step
 
@@ -31,6 +27,8 @@ SOLVERS = {
     "RKL2": (ltl.RKL2(), 2, (64, 256)),
     "RKL1": (ltl.RKL1(), 1, (16, 64)),
 }
+
+
 FULLY_IMPLICIT = ["BackwardEuler", "CrankNicolson", "TRBDF2", "Kvaerno3", "Kvaerno5"]
 
 
@@ -121,6 +119,8 @@ FORCED = {
     "KenCarp3": ((64, 256), (64, 256)), "KenCarp4": ((8, 24), (8, 24)), "KenCarp5": ((64, 128), (8, 24)),
     "Kvaerno5": ((48, 96), (12, 24)),
 }  # fmt: skip
+
+
 QUICK = ["TRBDF2", "SBDF2", "KenCarp4", "RKL2"]
 
 
@@ -188,23 +188,6 @@ def test_a_fixed_step_that_needs_more_than_all_stages_is_taken_in_parts(sphere):
     assert not jnp.isfinite(jax.jit(lambda d: end(d).u_end)(1e5)).any()
 
 
-def test_a_rejected_step_does_not_spoil_the_derivative(sphere):
-    rough = jnp.asarray(np.random.default_rng(0).normal(size=sphere.num_vertices))
-    solver = dataclasses.replace(ltl.RKL2(), loop_kind="bounded")
-
-    def after(diffusivity):
-        # The step is so long that its stages would overflow.
-        begin, end = jnp.zeros(()), jnp.ones(())
-        args = (ltl.Diffusion(diffusivity), sphere)
-        terms = diffrax.ODETerm(lambda t, u, args: args[0].rate(t, args[1], u))
-        state = solver.init(terms, begin, end, rough, args)
-        stepped, error, *_ = solver.step(terms, begin, end, rough, args, state, made_jump=jnp.array(False))
-        is_taken = jnp.isfinite(error).all()
-        return jnp.sum(jnp.where(is_taken, stepped, diffusivity * rough))
-
-    np.testing.assert_allclose(jax.grad(after)(1e9), jnp.sum(rough))
-
-
 @pytest.mark.parametrize("solver", [ltl.BackwardEuler(), ltl.RKL2()], ids=["BackwardEuler", "RKL2"])
 def test_fixed_steps_run_in_float32_for_any_requested_times(solver):
     surface = ltl.Surface.from_mesh(ltl.shapes.icosphere(2), dtype=jnp.float32)
@@ -225,128 +208,6 @@ def test_adaptive_implicit_steps_follow_the_tolerance(sphere, decay, name):
         errors.append(float(jnp.linalg.norm(end - exact) / np.linalg.norm(exact)))
     assert errors[0] < 1e-2
     assert errors[1] < 0.03 * errors[0]
-
-
-GRADIENTS = {
-    "explicit": (diffrax.Heun(), dict(dt=0.01)),
-    "RKL2": (ltl.RKL2(), dict(dt=0.1)),
-    "SBDF2": (ltl.SBDF2(), dict(dt=0.1)),
-    "KenCarp3": (diffrax.KenCarp3(), dict(dt=0.2)),
-    "TRBDF2": (ltl.TRBDF2(), dict(dt=0.2)),
-}
-
-
-def families(*quick):
-    """All families of solvers, those that are not quick marked as slow: each is quick in one of the two tests below."""
-    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in GRADIENTS]
-
-
-def assert_second_order_remainders(loss, at, directions, smallest_slope=0.0):
-    """The remainder of a linear model of the loss falls like the square of the step, in each direction."""
-    both = jax.jit(jax.value_and_grad(loss))
-    value, gradient = both(at)
-    for key, direction in directions.items():
-        slope = jnp.sum(gradient[key] * direction)
-        assert abs(slope) > smallest_slope
-        rest = [abs(both({**at, key: at[key] + h * direction})[0] - value - h * slope) for h in (0.1, 0.01)]
-        assert abs(np.log10(rest[0] / rest[1]) - 2) < 0.1, key
-
-
-@pytest.mark.parametrize("name", families("RKL2"))
-def test_taylor_remainders_are_of_second_order_through_every_family(sphere, name):
-    solver, how = GRADIENTS[name]
-    x = sphere.vertices
-    hierarchy = ltl.solvers.multigrid(sphere)
-    u0 = jnp.stack([1 - 0.5 * jnp.exp(-4 * x[:, 0] ** 2), 0.5 * jnp.exp(-4 * x[:, 1] ** 2)], axis=1)
-
-    def loss(parameters):
-        kinetics = ltl.kinetics.gray_scott(parameters["feed"], 0.06)
-        equation = ltl.ReactionDiffusion((parameters["diffusivity"], 0.01), kinetics)
-        moved = sphere.with_vertices(x + parameters["vertices"])
-        start = u0 * (1 + parameters["start"][:, None])
-        options = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
-        end = ltl.solve(equation, moved, start, 1.0, solver=solver, **options).us[-1]
-        return jnp.sum(end**2 * x[:, :2])
-
-    random = np.random.default_rng(0)
-    at = dict(
-        diffusivity=jnp.array(0.1), feed=jnp.array(0.04), vertices=0.1 * x[:, :1] * x,
-        start=jnp.asarray(0.1 * random.normal(size=sphere.num_vertices)),
-    )  # fmt: skip
-    directions = dict(
-        diffusivity=0.1, feed=0.03, start=0.2 * random.normal(size=sphere.num_vertices),
-        vertices=0.1 * random.normal(size=x.shape),
-    )  # fmt: skip
-    assert_second_order_remainders(loss, at, directions)
-
-
-@pytest.mark.parametrize("name", families("explicit", "SBDF2", "KenCarp3"))
-def test_taylor_remainders_of_boundary_data_and_fields_through_every_family(name):
-    solver, how = GRADIENTS[name]
-    surface = ltl.Surface.from_mesh(ltl.shapes.disk(rings=6))
-    x = surface.vertices
-    hierarchy = ltl.solvers.multigrid(surface)
-
-    def loss(parameters):
-        # A logistic reaction whose rate is a field, with a source, values held on one side and a flux on the other.
-        conditions = (
-            ltl.Neumann(parameters["flux"] * jnp.sin(x[:, 1])),
-            ltl.Dirichlet(parameters["values"], where=lambda x: x[:, 0] > 0.2),
-        )
-        equation = ltl.ReactionDiffusion(
-            (0.1,), lambda species, p: (p["rate"] * species[0] * (1 - species[0]) + p["source"],),
-            params=dict(rate=parameters["rate"], source=parameters["source"]), boundary=conditions,
-        )  # fmt: skip
-        options = dict(rtol=1e-11, atol=1e-12, throw=False, preconditioner=hierarchy, **how)
-        end = ltl.solve(equation, surface, 0.2 + 0 * x[:, :1], 1.0, solver=solver, **options).us[-1]
-        return jnp.sum(end[:, 0] ** 2 * jnp.cos(x[:, 0]))
-
-    field = jnp.asarray(np.random.default_rng(0).uniform(size=surface.num_vertices))
-    at = dict(values=0.3 + field, flux=jnp.array(0.5), rate=1 + field, source=0.2 * field)
-    directions = dict(values=0.5 * field, flux=jnp.array(0.5), rate=field, source=field)
-    assert_second_order_remainders(loss, at, directions, smallest_slope=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", GRADIENTS)
-def test_the_direct_adjoint_has_the_derivatives_of_checkpoints(sphere, name):
-    solver, how = GRADIENTS[name]
-    x1 = sphere.vertices[:, 0]
-
-    def end(rate, adjoint):
-        equation = ltl.ReactionDiffusion((0.2,), lambda species, p: (p * species[0] - species[0] ** 2,), params=rate)
-        options = dict(rtol=1e-11, atol=1e-12, throw=False, max_steps=100, adjoint=adjoint, **how)
-        return jnp.sum(ltl.solve(equation, sphere, 1 + x1[:, None], 1.0, solver=solver, **options).us[-1] ** 2)
-
-    checkpointed = jax.grad(end)(jnp.array(1.5), None)
-    for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(derivative(end)(jnp.array(1.5), diffrax.DirectAdjoint()), checkpointed, rtol=1e-7)
-
-
-def test_a_source_field_is_differentiated_in_forward_and_reverse(sphere):
-    x1 = sphere.vertices[:, 0]
-
-    def end(source, adjoint=None):
-        equation = ltl.Diffusion(0.5, source=source)
-        solution = ltl.solve(equation, sphere, 0 * x1, 1.0, solver=ltl.TRBDF2(), dt=0.25, adjoint=adjoint, rtol=1e-10)
-        return jnp.sum(solution.us[-1] * jnp.cos(3 * x1))
-
-    reverse = jax.grad(end)(x1)
-    _, forward = jax.jvp(lambda source: end(source, diffrax.ForwardMode()), (x1,), (x1**2,))
-    np.testing.assert_allclose(jnp.sum(reverse * x1**2), forward, rtol=1e-8)
-    # The run is linear in the source, so the difference is exact.
-    np.testing.assert_allclose(end(x1 + x1**2) - end(x1), forward, rtol=1e-7)
-
-
-def test_ensembles_are_vmapped_through_implicit_steps(sphere):
-    x = sphere.vertices
-    run = lambda d, u: ltl.solve(  # noqa: E731
-        ltl.Diffusion(d), sphere, u, 0.5, solver=ltl.TRBDF2(), dt=0.1, rtol=1e-10, throw=False
-    ).us[-1]
-    rates, starts = jnp.array([0.5, 1.0, 2.0]), jnp.stack([x[:, 0], x[:, 1], x[:, 2] ** 2])
-    batch = jax.vmap(run)(rates, starts)
-    for d, u, end in zip(rates, starts, batch, strict=True):
-        np.testing.assert_allclose(end, run(d, u), atol=1e-9)
 
 
 def test_jacobi_is_used_where_multigrid_is_not_available(sphere, monkeypatch):
@@ -393,91 +254,6 @@ def test_a_dense_solution_can_be_evaluated_at_any_time(sphere):
         ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
 
 
-def field_diffusion(field):
-    return ltl.ReactionDiffusion((field,), lambda species, _: (0 * species[0],))
-
-
-def two_rates(species, _):
-    u, v = species
-    return -u, -v
-
-
-def one_rate(species, _):
-    return (-species[0],)
-
-
-def no_tuple(species, _):
-    return -species[0]
-
-
-WRONG = {
-    "negative diffusivity": (dict(equation=ltl.Diffusion(-1.0)), "not negative, found -1"),
-    "a diffusivity of a species that is negative": (
-        dict(equation=ltl.Diffusion(jnp.array([1.0, -2.0])), u0=jnp.ones((162, 2))),
-        "found -2 at species 1",
-    ),
-    "a diffusivity that is negative somewhere": (
-        dict(equation=field_diffusion(jnp.ones(162).at[7:9].set(-0.5)), u0=jnp.ones((162, 1))),
-        r"found -0\.5 at vertex 7 in the equation's\.diffusivity\[0\]",
-    ),
-    "an equation that is not finite": (dict(equation=ltl.Diffusion(float("inf"))), "diffusivity is not finite"),
-    "a state of another length": (dict(u0=jnp.ones(5)), r"found \(5,\)"),
-    "a source of another shape": (dict(equation=ltl.Diffusion(source=jnp.ones(5))), r"found \(5,\)"),
-    "times out of order": (dict(ts=[0.5, 0.2]), r"ts\[1\] = 0.2 after 0.5"),
-    "times beyond the end": (dict(ts=[0.5, 2.0]), r"found ts\[1\] = 2.0"),
-    "an end before the start": (dict(t0=3.0), "t0 = 3.0 and t1 = 1.0"),
-    "no times": (dict(ts=[]), "at least one time"),
-    "a relative tolerance of zero": (dict(rtol=0.0), "found rtol = 0.0"),
-    "a negative absolute tolerance": (dict(atol=-1e-6), "found atol = -1e-06"),
-    "a step that is not positive": (dict(dt=0.0), "dt = 0.0"),
-    "an explicit step too long": (dict(dt=0.5, solver=diffrax.Tsit5()), "too long for Tsit5"),
-    "SBDF2 without steps": (dict(solver=ltl.SBDF2()), "SBDF2 takes fixed steps"),
-    "a step length that contradicts steps": (
-        dict(steps=ltl.solvers.Adaptive(), dt=0.1), r"dt = 0\.1 contradicts steps = Adaptive",
-    ),
-    "a tolerance that contradicts steps": (
-        dict(steps=ltl.solvers.Fixed(0.1, rtol=1e-6), rtol=1e-4), r"rtol = 0\.0001 contradicts steps = Fixed",
-    ),
-    "a limit of steps that contradicts steps": (
-        dict(steps=ltl.solvers.Adaptive(), max_steps=None), "max_steps = None contradicts steps",
-    ),
-    "settings of a solver that would have no effect": (
-        dict(solver=diffrax.Kvaerno3(root_finder=optx.Newton(1e-3, 1e-3))), "a root_finder, which would have no effect",
-    ),
-    "a masked state": (dict(u0=np.ma.masked_greater(np.arange(162.0), 9)), "u0 as a plain array, found a masked"),
-    "a reaction of another number of species": (
-        dict(equation=ltl.ReactionDiffusion((1.0, 1.0, 1.0), two_rates), u0=jnp.ones((162, 3))),
-        "The state has 3 species, and the reaction is for another number",
-    ),
-    "a reaction with one rate for two species": (
-        dict(equation=ltl.ReactionDiffusion((1.0, 1.0), one_rate), u0=jnp.ones((162, 2))),
-        r"a tuple of 2 rates, one for each species, of shape \(162,\), found 1",
-    ),
-    "a reaction with a rate that is no tuple": (
-        dict(equation=ltl.ReactionDiffusion((1.0, 1.0), no_tuple), u0=jnp.ones((162, 2))), "a tuple of 2 rates",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_each_mistake_is_one_clear_error(sphere, case):
-    given, message = WRONG[case]
-    call = dict(equation=ltl.Diffusion(), surface=sphere, u0=sphere.vertices[:, 0], t1=1.0) | given
-    with pytest.raises(ValueError, match=message):
-        ltl.solve(**call)
-
-
-def test_steps_and_their_shorthands_are_the_same_run(sphere):
-    run = functools.partial(ltl.solve, HEAT, sphere, sphere.vertices[:, 0], 0.1, solver=ltl.RKL2())
-    fixed = run(steps=ltl.solvers.Fixed(0.02))
-    np.testing.assert_array_equal(fixed.u_end, run(dt=0.02).u_end)
-    np.testing.assert_array_equal(fixed.u_end, run(steps=ltl.solvers.Fixed(0.02), dt=0.02).u_end)
-    adaptive = run(steps=ltl.solvers.Adaptive(rtol=1e-6, atol=1e-8))
-    np.testing.assert_array_equal(adaptive.u_end, run(rtol=1e-6, atol=1e-8).u_end)
-    with pytest.raises(TypeError, match=r"Expected steps as ltl\.solvers\.Adaptive\(\.\.\.\)"):
-        run(steps=0.02)
-
-
 def test_the_longest_stable_step_is_that_of_the_stiffest_mode(sphere):
     values = np.linalg.eigvals(ltl.laplacian_matrix(sphere).todense())
     longest = longest_step(diffrax.Heun(), np.abs(values).max(), 0.0)
@@ -515,65 +291,3 @@ def test_long_stiff_runs_take_implicit_steps_by_default(sphere):
     assert reacted.method.startswith("RKL2: explicit")
     traced = jax.jit(lambda d: ltl.solve(ltl.Diffusion(d), sphere, sphere.vertices[:, 0], 1.0, max_steps=10))
     assert traced(1e4).method.startswith("RKL2")
-
-
-def test_other_lengths_and_tolerances_need_no_compilation(sphere):
-    traced = []
-
-    def source(t, x):
-        traced.append(t)
-        return x[:, 0]
-
-    equation = ltl.Diffusion(1e4, source=source)
-    runs = []
-    for t1, rtol in ((1.0, 1e-4), (2.0, 2e-4)):
-        solution = ltl.solve(equation, sphere, sphere.vertices[:, 0], t1, rtol=rtol)
-        runs.append((solution.method, len(traced)))
-    (first, traced_first), (second, traced_second) = runs
-    assert first.startswith("TRBDF2: implicit")
-    assert first != second
-    # The source is evaluated once before the run, outside of jit.
-    assert traced_second - traced_first <= 1
-
-
-def test_the_error_of_an_unstable_fixed_step_names_dt_first(sphere):
-    # The step is stable at the initial state, but too long once the reaction has stiffened.
-    stiffening = ltl.ReactionDiffusion((0.1,), lambda species, _: (1000 - species[0] ** 3,))
-    with pytest.raises(ltl.SolveError, match=r"overflowed.* The causes are \(a\) a dt that is too long for the solver"):
-        ltl.solve(stiffening, sphere, 0 * sphere.vertices[:, :1], 1.0, solver=diffrax.Heun(), dt=0.02)
-
-
-@pytest.mark.parametrize("dt", [None, 0.01])
-def test_times_after_the_stop_are_nan_and_the_state_there_is_u_end(sphere, dt):
-    u0 = sphere.vertices[:, 0]
-    solution = ltl.solve(
-        ltl.Diffusion(), sphere, u0, 1.0, ts=[0.1, 0.9], dt=dt, stop_when=lambda t, u, rate: jnp.max(u) < 0.5
-    )
-    assert bool(solution.stopped)
-    assert 0.1 < float(solution.t_end) < 0.9
-    assert np.isfinite(solution.us[0]).all()
-    assert np.isnan(solution.us[1]).all()
-    assert float(jnp.max(solution.u_end)) < 0.5
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        np.ma.masked_greater(np.arange(5.0), 3),
-        np.full(5, "2026", "datetime64[Y]"),
-        np.full(5, "1"),
-        ["0.5", "1"],
-        np.datetime64("2026"),
-        np.ones(5, complex),
-        np.array([1, None]),
-    ],
-    ids=["masked", "dates", "digits", "a list of digits", "a date", "complex", "objects"],
-)
-def test_values_that_do_not_convert_to_numbers_are_refused(value):
-    with pytest.raises(ValueError, match="Expected u0 as"):
-        as_numbers("u0", value)
-
-
-def test_numbers_of_all_kinds_are_accepted():
-    for value in (1, 2.0, True, [1, 2.5], np.arange(3), np.float32(1), jnp.ones(3), [jnp.ones(()), 2]):
-        assert as_numbers("u0", value) is value

@@ -48,4 +48,7 @@ def deprecated_alias(old: str, new: Callable[P, R]) -> Callable[P, R]:
         warn_deprecated(old, new.__name__)
         return new(*args, **kwargs)
 
+    # Under its own name and module, so that it can be pickled.
+    alias.__module__, _, alias.__name__ = old.rpartition(".")
+    alias.__qualname__ = alias.__name__
     return alias

@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.arguments import as_numbers
+from .._base.arguments import as_numbers, kind_of
 from .._base.deprecated import warn_deprecated
 from .._base.owned_folder import Folder
 from .._equations import Equation
@@ -57,13 +57,16 @@ def _with_old_keywords(function: Callable[P, Solution]) -> Callable[P, Solution]
     @functools.wraps(function)
     def accepting(*args: P.args, **kwargs: P.kwargs) -> Solution:
         options: dict[str, Any] = {}
+        checkpoints = kwargs.get("checkpoints")
+        if checkpoints is not None and not isinstance(checkpoints, Checkpoints):
+            raise TypeError(f"Expected checkpoints as ltl.solvers.Checkpoints(folder), found {kind_of(checkpoints)}.")
         for old, new in new_names.items():
             if old in kwargs:
                 warn_deprecated(f"The argument {old} of solve", "checkpoints=ltl.solvers.Checkpoints(folder, ...)")
                 options[new] = kwargs.pop(old)
+        if options and checkpoints is not None:
+            raise TypeError("solve() got both checkpoints and keywords that it replaces. Give them inside checkpoints.")
         if options.get("folder") is not None:
-            if kwargs.get("checkpoints") is not None:
-                raise TypeError("solve() got both checkpoints and its old name checkpoint_dir.")
             kwargs["checkpoints"] = Checkpoints(**options)
         elif options.get("resume") or options.get("every") is not None:
             option = "resume=True" if options.get("resume") else f"checkpoint_every={options['every']}"

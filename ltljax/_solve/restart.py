@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arguments import positive
 from .._base.owned_folder import Folder
 from .fingerprint import fingerprint
 
@@ -51,8 +52,8 @@ class Checkpoints:
     run_id: str | None = None
 
     def __post_init__(self):
-        if self.every is not None and not self.every > 0:
-            raise ValueError(f"Expected a positive length of intervals, found every = {self.every}.")
+        if self.every is not None:
+            positive("every", self.every)
 
     def fingerprint_of(self, value: Any) -> str:
         """The fingerprint of a value that may contain functions, or of ``run_id`` if there is one.
@@ -132,8 +133,8 @@ class Keeper:
         differing = [name for name in self._run if earlier.get(name) != self._run[name]]
         if differing:
             raise RestartError(
-                f"The files in {path.parent} belong to a run with another {', another '.join(differing)}. Repeat that "
-                "run unchanged, or name another folder."
+                f"The files in {path.parent} belong to another run, or to another version of ltljax: they differ in "
+                f"{', '.join(differing)}. Repeat that run unchanged, or name another folder."
             )
 
     def _read(self) -> None:

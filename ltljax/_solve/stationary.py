@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._base.deprecated import renamed_arguments
 from .._equations import Diffusion, Equation, boundary as bounds
-from .._lifting.schemes import Monotone
 from .._surface import Surface, on_surface
 from .._tables import AnyArray
 from . import checks
@@ -125,7 +124,7 @@ def steady_state(
     if isinstance(equation, Diffusion) and is_linear:
         return _steady_diffusion(equation, surface, start, u0, time, inverse, throw)
     root = _steady_by_newton(equation, surface, start, time, inverse, rtol)
-    if throw and not isinstance(root.u, Tracer) and not float(root.rate) <= float(root.bound):
+    if throw and not isinstance(root.u, Tracer) and (bool(root.outgrew) or not float(root.rate) <= float(root.bound)):
         raise SolveError(
             f"No stationary state was found: after {int(root.steps)} steps the rate is {float(root.rate):.2g}, "
             f"expected at most {float(root.bound):.2g}. Possible causes are (a) a state that oscillates, travels or "
@@ -162,9 +161,7 @@ def _steady_diffusion(
             )
     if any(not isinstance(condition, bounds.Neumann) for condition in equation.conditions):
         return state.u
-    is_conserving = isinstance(surface.scheme, Monotone) and not surface.is_traced
-    measure = surface.mass if is_conserving else surface.vertex_areas
-    return state.u + component_means(surface, u0 - state.u, measure)[surface.topology.components]
+    return state.u + component_means(surface, u0 - state.u, surface.quadrature)[surface.topology.components]
 
 
 class _Root(NamedTuple):
@@ -175,12 +172,14 @@ class _Root(NamedTuple):
         rate: root mean square of the rate at it.
         bound: root mean square up to which the state counts as stationary.
         steps: number of steps of the continuation.
+        outgrew: whether the continuation ended because the state had grown too large to become stationary.
     """
 
     u: Float[Array, "V *S"]
     rate: Float[Array, ""]
     bound: Float[Array, ""]
     steps: Int[Array, ""]
+    outgrew: Bool[Array, ""]
 
 
 @eqx.filter_jit
@@ -206,11 +205,13 @@ def _steady_by_newton(
     smallest = jax.lax.stop_gradient(jnp.maximum(rms(rate(u0)) * dt0, jnp.finfo(u0.dtype).tiny))
     largest = _GROWN * jnp.maximum(rms(u0), smallest)
     u, steps = _continuation(rate, inverse, u0, dt0, smallest, largest, rtol)
+    # Newton's method may lead from such a state to another one, such as zero, that u0 does not evolve to.
+    outgrew = rms(u) > largest
     u = equation.held(time, surface, _newton(rate, inverse(0.0), u, rtol))
     # Rounding may leave a larger rate than the tolerance allows.
     rounding = 20 * jnp.finfo(u.dtype).eps * equation.spectral_bound(time, surface, u)
     bound = jnp.where(rms(u) <= largest, jnp.maximum(10 * rtol, rounding) * rms(u), 0)
-    return _Root(u, rms(rate(u)), bound, steps)
+    return _Root(u, rms(rate(u)), bound, steps, outgrew)
 
 
 def _continuation(

@@ -75,6 +75,10 @@ class Fixed:
     atol: ArrayLike | None = None
     max_steps: int | None = 1_000_000
 
+    def __post_init__(self):
+        if self.dt is None:
+            raise ValueError("Expected the length of steps, found Fixed(None). For adaptive steps use Adaptive().")
+
 
 def settings_of(
     steps: Adaptive | Fixed | None,

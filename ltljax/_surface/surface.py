@@ -235,7 +235,9 @@ class Surface(eqx.Module):
                 "The mass is computed on the host, but the surface is being traced by a JAX transformation. Compute "
                 "`mass = surface.mass` outside and pass it as an argument."
             )
-        return self.remembered("mass", lambda: self._stationary_measure(difference_matrix(diffusion, weights)))
+        # Inside jit, a surface that is not traced is still computed with at once.
+        with jax.ensure_compile_time_eval():
+            return self.remembered("mass", lambda: self._stationary_measure(difference_matrix(diffusion, weights)))
 
     def _stationary_measure(self, generator) -> Float[Array, " V"]:
         return jnp.asarray(stationary_measure(generator, np.asarray(self.vertex_areas)), self.dtype)

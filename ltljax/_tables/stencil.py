@@ -1,7 +1,8 @@
 """`Stencil`: a linear operator on fields, as weights on the differences to the neighbours of a table.
 
 What enters: a table and its weights. What leaves: the operator applied to a field, its transpose, its matrix, its
-diagonal and a bound of its spectrum. `ComposedStencil` is a sum of products of stencils with the same methods.
+diagonal and a bound of its spectrum. `ComposedStencil` is a sum of products of stencils, with the methods that solvers
+and equations need.
 """
 
 from typing import ClassVar, Literal
@@ -88,8 +89,11 @@ class Stencil(eqx.Module):
         not positive.
 
         Raises:
-            ValueError: the stencil has a centre, which no conductivity between vertices belongs to.
+            ValueError: the mean is unknown, or the stencil has a centre, which a conductivity between vertices cannot
+                scale.
         """
+        if mean not in self.means:
+            raise ValueError(f"Expected a mean of {' or '.join(map(repr, self.means))}, found {mean!r}.")
         if self.centre is not None:
             raise ValueError("Expected a stencil of differences only, found one with a weight of the vertex itself.")
         rises = differences(self.table, g)
@@ -118,13 +122,18 @@ class ComposedStencil(eqx.Module):
         parts = [outer(inner(u)) for outer, inner in zip(self.outer, self.inner, strict=True)]
         return sum(parts[1:], start=parts[0])
 
+    def transpose(self, y: Float[Array, "V *S"]) -> Float[Array, "V *S"]:
+        """The transposed operator applied to y."""
+        (transposed,) = jax.linear_transpose(self, y)(y)
+        return transposed
+
     def matrix(self) -> scipy.sparse.csr_array:
         """The operator as a SciPy sparse matrix (V, V) (host)."""
         parts = [outer.matrix() @ inner.matrix() for outer, inner in zip(self.outer, self.inner, strict=True)]
         return scipy.sparse.csr_array(sum(parts[1:], start=parts[0]))
 
     def diagonal(self) -> Float[Array, " V"]:
-        """Minus half the spectral bound: a bound of the diagonal, whose entries no table holds."""
+        """A stand-in for the diagonal, whose entries no table holds: minus half the spectral bound, (V,)."""
         return jnp.full(self.inner[0].table.num_vertices, -self.spectral_bound() / 2)
 
     def spectral_bound(self) -> Float[Array, ""]:

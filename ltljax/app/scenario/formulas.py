@@ -53,7 +53,7 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 # The same for every operator, by its node type.
 _OPERATORS: dict[type, tuple[int, Callable[..., Any]]] = {
     ast.Add: (2, lambda a, b: a + b), ast.Sub: (2, lambda a, b: a - b), ast.Mult: (2, lambda a, b: a * b),
-    ast.Div: (2, lambda a, b: a / b), ast.Pow: (2, jnp.power), ast.USub: (1, lambda a: -a), ast.UAdd: (1, lambda a: a),
+    ast.Div: (2, lambda a, b: a / b), ast.Pow: (2, jnp.power), ast.USub: (1, lambda a: -a),
     ast.Lt: (2, _truth(lambda a, b: a < b)), ast.LtE: (2, _truth(lambda a, b: a <= b)),
     ast.Gt: (2, _truth(lambda a, b: a > b)), ast.GtE: (2, _truth(lambda a, b: a >= b)),
     ast.Eq: (2, _truth(lambda a, b: a == b)), ast.NotEq: (2, _truth(lambda a, b: a != b)),
@@ -205,7 +205,7 @@ class _Parser:
                 self.visit(operand, depth + 1)
                 if isinstance(operator, ast.USub) and isinstance(self.steps[-1], float):
                     self.steps[-1] = -self.steps[-1]
-                else:
+                elif not isinstance(operator, ast.UAdd):
                     self.steps.append(type(operator))
             case ast.BinOp():
                 self.binary(node, depth)
