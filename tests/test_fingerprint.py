@@ -102,7 +102,7 @@ class Opaque:
 PRINT = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from test_restart import Opaque, fingerprint, is_pattern, ltl, np
+from test_fingerprint import Opaque, fingerprint, is_pattern, ltl, np
 print(fingerprint([is_pattern, Opaque(1.0), ltl.RKL2(), np.float32]))
 """
 
