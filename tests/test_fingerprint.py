@@ -99,6 +99,10 @@ class Opaque:
         return self.rate * x
 
 
+def is_pattern(x):
+    return x in {"spots", "stripes", "holes", "waves"}
+
+
 PRINT = """
 import sys
 sys.path.insert(0, sys.argv[1])

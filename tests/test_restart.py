@@ -330,10 +330,6 @@ def test_rounding_makes_no_extra_interval(case, tmp_path, how):
     assert sorted(os.listdir(tmp_path))[-1] == "state_000008.npz"
 
 
-def is_pattern(x):
-    return x in {"spots", "stripes", "holes", "waves"}
-
-
 def test_a_run_of_zero_length_can_be_kept(case, tmp_path):
     equation, surface, u0 = case
     solution = ltl.solve(equation, surface, u0, 0.0, checkpoints=Checkpoints(tmp_path), dt=0.1)
