@@ -104,6 +104,14 @@ def test_held_values_that_depend_on_time_are_held_exactly():
     assert_second_order(errors, 1e-3)
 
 
+def test_the_rate_at_held_values_is_the_time_derivative_of_their_data():
+    surface, r, _ = disk(6)
+    condition = ltl.Dirichlet(lambda t, v: jnp.sin(3 * t) * v[:, 0])
+    rate = ltl.Diffusion(boundary=condition).rate(jnp.asarray(0.4), surface, jnp.asarray(1 - r**2))
+    rim = surface.topology.boundary
+    np.testing.assert_allclose(rate[rim], 3 * np.cos(1.2) * surface.vertices[rim, 0], rtol=1e-12, atol=1e-14)
+
+
 def test_a_gradient_gives_the_flux_on_both_sides_of_the_corners_of_a_square():
     errors, modes = [], []
     for n in (24, 48):
@@ -224,6 +232,15 @@ def test_rows_at_corners_of_any_angle_are_non_negative_and_exact(angle):
     linear = points @ np.array([2.0, -3.0])
     flux = np.broadcast_to([2.0, -3.0, 0.0], (len(points), 3))
     assert float(ltl.laplacian(surface, linear, flux)[0]) == pytest.approx(0, abs=1e-9)
+
+
+def test_rows_at_right_corners_are_exact_for_both_second_derivatives():
+    mesh = ltl.shapes.jittered(ltl.shapes.square(n=8), 0.2, seed=0)
+    vertices = mesh.vertices * [1.0, 0.6, 1.0]
+    surface = ltl.Surface.from_mesh(ltl.Mesh(vertices, mesh.faces))
+    for corner in (0, 8, 72, 80):
+        for squared in (vertices - vertices[corner]).T[:2] ** 2:
+            assert float(ltl.laplacian(surface, jnp.asarray(squared))[corner]) == pytest.approx(2)
 
 
 @pytest.mark.parametrize("lift", ["intrinsic", "chord"])

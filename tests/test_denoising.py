@@ -100,6 +100,13 @@ def test_denoising_on_a_grid_is_as_good_as_chambolles_projection_on_pixels():
     assert abs(max(on_surface) - max(pixels)) < 0.5
 
 
+def test_the_gradient_on_the_faces_is_exact_for_linear_fields():
+    mesh = ltl.shapes.jittered(ltl.shapes.square(n=6), 0.3, seed=0)
+    surface = ltl.Surface.from_mesh(mesh)
+    gradient = HatGradients.from_surface(surface).gradient(jnp.asarray(mesh.vertices @ [[3.0], [4.0], [0.0]]))
+    np.testing.assert_allclose(jnp.linalg.norm(gradient[..., 0], axis=0), 5.0, rtol=1e-9)
+
+
 @pytest.mark.parametrize("argument", ["strength", pytest.param("noise", marks=pytest.mark.slow)])
 def test_the_denoised_image_has_the_derivative_of_the_minimiser(sphere, argument):
     x = sphere.surface.vertices

@@ -28,6 +28,12 @@ def test_the_covariance_matches_repeated_experiments():
     np.testing.assert_allclose(spread, fit.evidence.std, rtol=0.15)
 
 
+def test_the_covariance_is_that_of_the_parameter_whatever_its_transform():
+    data = ltl.Observations(3 * CURVE, 0.1)
+    fit = ltl.fit(lambda p: p * jnp.asarray(CURVE), 2.0, data, transforms=ltl.inverse.Positive())
+    np.testing.assert_allclose(np.ravel(fit.covariance), [0.01 / np.sum(CURVE**2)], rtol=1e-6)
+
+
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
 def test_the_covariance_of_a_robust_loss_is_the_sandwich(loss):
     """The textbook's formula for a linear model, from derivatives of the loss as a whole."""
@@ -223,6 +229,14 @@ def test_losses_along_a_parameter_show_where_the_loss_is_not_quadratic():
     )
     with pytest.raises(ValueError, match="There is no parameter 'b'"):
         linear.losses_along("b", deviations)
+
+
+def test_the_reduced_chi_square_is_relative_to_the_degrees_of_freedom():
+    rng = np.random.default_rng(0)
+    design, values = rng.normal(size=(6, 3)), rng.normal(size=6)
+    fit = ltl.fit(lambda p: jnp.asarray(design) @ p, np.zeros(3), ltl.Observations(values, 0.5))
+    misfit = (values - design @ np.linalg.lstsq(design, values)[0]) / 0.5
+    assert fit.agreement.reduced_chi_square == pytest.approx(np.sum(misfit**2) / (6 - 3), rel=1e-6)
 
 
 def test_the_chi_square_of_counts_is_one_even_for_low_rates():

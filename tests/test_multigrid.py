@@ -102,6 +102,16 @@ def test_every_krylov_solver_reaches_its_tolerance_in_any_unit(kind):
         np.testing.assert_allclose(matrix @ x, unit * b, atol=1e-8 * unit)
 
 
+def test_bicgstab_needs_no_more_iterations_than_there_are_eigenvalues():
+    random = np.random.default_rng(0)
+    vectors = np.eye(40) + 0.1 * random.normal(size=(40, 40))
+    matrix = jnp.asarray(vectors @ np.diag(np.repeat([1.0, 2.0, 5.0, 9.0], 10)) @ np.linalg.inv(vectors))
+    b = jnp.asarray(random.normal(size=40))
+    solution = lx.linear_solve(lx.MatrixLinearOperator(matrix), b, BiCGStab(1e-9), throw=False)
+    np.testing.assert_allclose(matrix @ solution.value, b, atol=1e-7)
+    assert int(solution.stats["num_steps"]) <= 4
+
+
 def test_gmres_takes_over_where_bicgstab_fails():
     # Rotations by a right angle: every residual is orthogonal to its image, so BiCGStab makes no progress.
     matrix = jnp.asarray(np.kron(np.diag(np.arange(1.0, 6.0)), [[0.0, 1.0], [-1.0, 0.0]]))

@@ -191,6 +191,11 @@ def test_gaps_may_be_given_as_nan_masks_or_masked_arrays(model, exact):
     assert (np.isnan(fits[0].residuals) == is_gap).all()
 
 
+def test_values_that_were_not_measured_have_no_misfit():
+    misfit = ltl.Observations([3.0, np.nan], 0.1).misfit(jnp.array([2.0, -1.0]))
+    np.testing.assert_allclose(misfit, [-10.0, 0.0])
+
+
 def test_derivatives_do_not_depend_on_values_that_were_not_measured():
     data = ltl.Observations([3.0, np.nan], "poisson")
     slope = jax.grad(lambda m: jnp.sum(data.misfit(m) ** 2))(jnp.array([2.0, -1.0]))

@@ -181,6 +181,8 @@ def test_a_run_in_intervals_equals_the_plain_run(case, tmp_path, how):
     np.testing.assert_array_equal(resumed.us, stored.us)
     np.testing.assert_allclose(resumed.ts, plain.ts)
     assert resumed.counts == stored.counts
+    if "dt" in how:
+        assert stored.counts["num_steps"] == plain.counts["num_steps"] == 20
 
 
 def test_old_keywords_still_work_and_warn(case, tmp_path):
