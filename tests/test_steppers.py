@@ -254,6 +254,12 @@ def test_a_dense_solution_can_be_evaluated_at_any_time(sphere):
         ltl.solve(ltl.Diffusion(), sphere, x1, 1.0).at(0.5)
 
 
+def test_sbdf2_is_exact_for_linear_growth_whatever_the_lengths_of_its_steps(sphere):
+    one, times = jnp.ones(sphere.num_vertices), np.array([0.1, 0.25, 0.3, 0.7])
+    run = ltl.solve(ltl.Diffusion(source=3 * one), sphere, one, 0.7, ts=times, solver=ltl.SBDF2(), dt=0.1)
+    np.testing.assert_allclose(run.us, np.outer(1 + 3 * times, one), rtol=1e-8)
+
+
 def test_the_longest_stable_step_is_that_of_the_stiffest_mode(sphere):
     values = np.linalg.eigvals(ltl.laplacian_matrix(sphere).todense())
     longest = longest_step(diffrax.Heun(), np.abs(values).max(), 0.0)
