@@ -85,7 +85,7 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
         raise ValueError(f"Expected as {name} one of {', '.join(choices)}, found {value!r}.")
 
 
-def check_positive(**options: float | None) -> None:
+def check_positive(**options: float | int | None) -> None:
     """Raise if one of the options is given and is not positive and finite."""
     for name, value in options.items():
         if value is not None and not 0 < value < np.inf:

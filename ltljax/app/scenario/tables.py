@@ -244,7 +244,7 @@ class Table:
         return value
 
 
-def _is_within(value: float, least: float = -math.inf, most: float = math.inf) -> bool:
+def _is_within(value: float | int, least: float = -math.inf, most: float = math.inf) -> bool:
     try:
         number = float(value)
     except OverflowError:
