@@ -95,7 +95,7 @@ def test_each_mistake_is_one_clear_error(sphere, case):
         ltl.solve(**call)
 
 
-def test_steps_and_their_shorthands_are_the_same_run(sphere):
+def test_steps_and_their_shorthands_are_the_same_run(sphere, as_users_call_it):
     run = functools.partial(ltl.solve, HEAT, sphere, sphere.vertices[:, 0], 0.1, solver=ltl.RKL2())
     fixed = run(steps=ltl.solvers.Fixed(0.02))
     np.testing.assert_array_equal(fixed.u_end, run(dt=0.02).u_end)

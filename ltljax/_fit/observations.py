@@ -318,7 +318,7 @@ class Observations(eqx.Module):
         return self.estimates_spread or self.relative_noise is not None
 
 
-def _measured(values: np.ndarray, mask: Any, is_given: Any) -> np.ndarray:
+def _measured(values: np.ndarray, mask: Any, is_given: Any) -> np.ndarray | np.bool:
     """Which values were measured and are not masked."""
     if values.size == 0:
         raise ValueError("Expected at least one observed value, found none.")

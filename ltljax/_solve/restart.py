@@ -47,7 +47,7 @@ class Checkpoints:
     """
 
     folder: str | Path
-    every: float | None = None
+    every: float | int | None = None
     resume: bool = False
     run_id: str | None = None
 

@@ -58,7 +58,7 @@ def parse_change(text: str) -> tuple[str, Any]:
 def read(
     text: str,
     name: str,
-    folder: Path,
+    folder: Path | str,
     changes: Mapping[str, Any] | None = None,
     mesh_file: Path | None = None,
     variant: str | None = None,
