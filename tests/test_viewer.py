@@ -57,7 +57,7 @@ def test_states_are_stored_with_sixteen_bits_and_nan_is_preserved(sphere):
 
 
 def test_a_uniform_state_at_a_single_time_is_stored(sphere):
-    page = viewer_html(sphere.vertices, sphere.faces, [0.0], {"u": np.full((1, sphere.num_vertices), 3.0)})
+    page = viewer_html(sphere.vertices, sphere.faces, np.zeros(1), {"u": np.full((1, sphere.num_vertices), 3.0)})
     np.testing.assert_allclose(decoded(page, 0), 3.0)
 
 

@@ -302,7 +302,7 @@ def _variances(data: Observations, residuals: np.ndarray, leverages: np.ndarray,
     return variances.ravel()
 
 
-def _level(data: Observations, spread: np.ndarray) -> float:
+def _level(data: Observations, spread: np.ndarray | np.floating) -> float:
     """The size of the data's variation, in the unit of the misfit."""
     values = np.asarray(data.values, np.float64)
     noise = np.broadcast_to(1.0 if data.noise is None else np.asarray(data.noise, np.float64), values.shape)

@@ -17,7 +17,7 @@ from .._tables import AnyArray
 def smoothness(
     surface: Surface,
     field: Float[AnyArray, " V"],
-    weight: float = 1.0,
+    weight: float | int | AnyArray = 1.0,
     mass: AnyArray | None = None,
     order: int = 1,
 ) -> Float[Array, "V *components"]:
@@ -46,8 +46,8 @@ def smoothness(
 def total_variation(
     surface: Surface,
     field: Float[AnyArray, " V"],
-    weight: float = 1.0,
-    rounding: float = 1e-3,
+    weight: float | int | AnyArray = 1.0,
+    rounding: float | int | AnyArray = 1e-3,
     mass: AnyArray | None = None,
 ) -> Float[Array, " V"]:
     """Residuals whose sum of squares is ``weight`` times the integral of sqrt(|grad f|^2 + rounding^2).

@@ -127,7 +127,9 @@ class Table:
         self.taken[key] = [table.taken for table in inner]
         return inner
 
-    def number(self, key: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
+    def number(
+        self, key: str, default: float | int, least: float | int = -math.inf, most: float | int = math.inf
+    ) -> float:
         """A finite number within bounds."""
         value = self._values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not _is_within(value, least, most):
@@ -179,7 +181,7 @@ class Table:
             raise self.error(key, f"one of {listed(allowed)}{did_you_mean(value, allowed)}")
         return self._take(key, value)
 
-    def formula(self, key: str, names: Iterable[str], default: float | str | None = None) -> Formula:
+    def formula(self, key: str, names: Iterable[str], default: float | int | str | None = None) -> Formula:
         """A number or a formula in some names."""
         value = self._values.get(key, default)
         is_number = isinstance(value, int | float) and not isinstance(value, bool) and _is_within(value)
@@ -202,7 +204,7 @@ class Table:
         self._take(key, value)
         return formulas
 
-    def numbers(self, key: str, default: tuple[float, ...], least: float, most: float) -> list[float]:
+    def numbers(self, key: str, default: tuple[float | int, ...], least: float | int, most: float | int) -> list[float]:
         """A list of as many numbers as the default has."""
         value = self._values.get(key, list(default))
         if not isinstance(value, list) or len(value) != len(default):
@@ -244,7 +246,7 @@ class Table:
         return value
 
 
-def _is_within(value: float | int, least: float = -math.inf, most: float = math.inf) -> bool:
+def _is_within(value: float | int, least: float | int = -math.inf, most: float | int = math.inf) -> bool:
     try:
         number = float(value)
     except OverflowError:
