@@ -171,7 +171,7 @@ def agreement(
     if len(outliers):
         outliers = outliers[np.argsort(-np.abs(residuals[tuple(outliers.T)]))]
     chi_square, expected = float("nan"), (float("nan"), float("nan"))
-    is_good = mask & ~is_outlier
+    is_good = np.asarray(mask & ~is_outlier)
     if data.loss.is_robust:
         free -= len(outliers)
     if is_known and free >= 1:
