@@ -15,8 +15,7 @@ TIMES = np.array([0.15, 0.45, 0.9])
 TRUTH = dict(a=0.12, b=0.85, dv=0.25)
 START = dict(a=0.15, b=0.7, dv=0.4)
 NOISE = 0.01
-# If each interval contains the truth with a probability of 95 %, at least 17 of 20 do with a probability of 98 %.
-SEEDS, ENOUGH = range(20), 17
+SEEDS = range(20)
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +49,14 @@ def model(request, sphere):
 @pytest.fixture(scope="module")
 def exact(model):
     return np.asarray(model(TRUTH, TIMES).us if isinstance(model, ltl.inverse.Experiment) else model(TRUTH))
+
+
+def enough(model):
+    """How many of 20 intervals have to contain the truth.
+
+    If each does with a probability of 95 %, at least 18 of 20 do with a probability of 92 %, and 17 with 98 %.
+    """
+    return 18 if isinstance(model, ltl.inverse.Experiment) else 17
 
 
 def noisy(exact, seed):
@@ -86,7 +93,7 @@ def test_intervals_contain_the_truth_despite_outliers(model, exact, loss):
         is_named[tuple(fit.agreement.outliers.T)] = True
         assert (is_named >= is_outlier).all()
         assert is_named.sum() - is_outlier.sum() <= 2
-    assert (counts >= ENOUGH).all(), counts
+    assert (counts >= enough(model)).all(), counts
 
 
 def test_intervals_contain_the_truth_with_a_third_of_the_values_missing(model, exact):
@@ -97,7 +104,7 @@ def test_intervals_contain_the_truth_with_a_third_of_the_values_missing(model, e
         fit = fitted(model, values)
         assert fit.converged
         counts += holds(fit)
-    assert (counts >= ENOUGH).all(), counts
+    assert (counts >= enough(model)).all(), counts
 
 
 def test_intervals_contain_the_truth_and_an_unknown_factor_of_each_species(model, exact):
@@ -110,7 +117,7 @@ def test_intervals_contain_the_truth_and_an_unknown_factor_of_each_species(model
         truth = np.array([*TRUTH.values(), *factors])
         assert fit.evidence.names[3:] == ("data.scale[0]", "data.scale[1]")
         counts += (low <= truth) & (truth <= high)
-    assert (counts >= ENOUGH).all(), counts
+    assert (counts >= enough(model)).all(), counts
 
 
 def test_an_offset_and_a_background_are_found(model, exact, sphere):
@@ -145,7 +152,7 @@ def test_intervals_of_counts_contain_the_truth(model, exact):
         fit = fitted(model, values, noise="poisson", scale=30.0)
         sizes.append(fit.agreement.reduced_chi_square)
         counts += holds(fit)
-    assert (counts >= ENOUGH).all(), counts
+    assert (counts >= enough(model)).all(), counts
     assert np.mean(sizes) == pytest.approx(1, abs=0.03)
 
 
@@ -157,7 +164,7 @@ def test_intervals_contain_the_truth_if_the_noise_grows_with_the_signal(model, e
         fit = fitted(model, values, noise=NOISE, relative_noise=0.1)
         sizes.append(fit.agreement.reduced_chi_square)
         counts += holds(fit)
-    assert (counts >= ENOUGH).all(), counts
+    assert (counts >= enough(model)).all(), counts
     assert np.mean(sizes) == pytest.approx(1, abs=0.03)
 
 
@@ -167,7 +174,7 @@ def test_the_reduced_chi_square_is_one_if_the_noise_is_right(model, exact):
         agreement = fitted(model, noisy(exact, seed), noise=NOISE).agreement
         low, high = agreement.expected
         num_inside += low < agreement.reduced_chi_square < high
-    assert num_inside >= ENOUGH
+    assert num_inside >= enough(model)
 
 
 @pytest.mark.parametrize("factor", [300.0, 1 / 300])
