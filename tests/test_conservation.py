@@ -72,6 +72,14 @@ def test_mass_is_computed_once_and_refused_inside_jit():
         jax.jit(lambda s: s.mass)(surface)
 
 
+def test_mass_and_quadrature_can_be_asked_for_inside_jit_if_the_surface_is_not_traced():
+    surface = ltl.Surface.from_mesh(ltl.shapes.jittered_sphere(1, 0.3, seed=0))
+    inside = jax.jit(lambda u: jnp.sum(surface.quadrature * u))(jnp.ones(surface.num_vertices))
+    np.testing.assert_allclose(inside, jnp.sum(surface.mass), rtol=1e-12)
+    traced = jax.jit(lambda s: s.quadrature)(surface)
+    np.testing.assert_array_equal(traced, surface.vertex_areas)
+
+
 def chain(rows):
     matrix = np.array(rows, float)
     return scipy.sparse.csr_array(matrix - np.diag(matrix.sum(axis=1)))

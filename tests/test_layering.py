@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -133,6 +134,18 @@ def test_names_that_moved_work_and_warn():
     for name in ltl._NEW_HOME:
         with pytest.warns(DeprecationWarning, match=rf"ltljax\.{name} is deprecated.*use ltljax\.\w+\.{name}"):
             assert getattr(ltl, name) is getattr(getattr(ltl, ltl._NEW_HOME[name]), name)
+
+
+def test_an_unknown_name_raises_the_usual_error():
+    with pytest.raises(AttributeError, match="module 'ltljax' has no attribute 'nothing'"):
+        ltl.nothing  # noqa: B018  (the access itself raises)
+
+
+@pytest.mark.parametrize("alias", ["imaging.smoothed", "imaging.denoise_mesh", "kinetics.turk"])
+def test_deprecated_functions_can_be_pickled(alias):
+    module, name = alias.split(".")
+    function = getattr(getattr(ltl, module), name)
+    assert pickle.loads(pickle.dumps(function)) is function
 
 
 def test_importing_the_package_does_not_import_jax():

@@ -104,6 +104,16 @@ def test_steps_and_their_shorthands_are_the_same_run(sphere, as_users_call_it):
     np.testing.assert_array_equal(adaptive.u_end, run(rtol=1e-6, atol=1e-8).u_end)
     with pytest.raises(TypeError, match=r"Expected steps as ltl\.solvers\.Adaptive\(\.\.\.\)"):
         run(steps=0.02)
+    with pytest.raises(ValueError, match=r"found Fixed\(None\)"):
+        ltl.solvers.Fixed(None)
+
+
+def test_checkpoints_are_a_value_and_not_mixed_with_what_they_replace(sphere, tmp_path, as_users_call_it):
+    run = functools.partial(ltl.solve, HEAT, sphere, sphere.vertices[:, 0], 0.1)
+    with pytest.raises(TypeError, match=r"Expected checkpoints as ltl\.solvers\.Checkpoints\(folder\), found a str"):
+        run(checkpoints=str(tmp_path))
+    with pytest.warns(DeprecationWarning, match="run_id"), pytest.raises(TypeError, match="keywords that it replaces"):
+        run(checkpoints=ltl.solvers.Checkpoints(tmp_path), run_id="a")
 
 
 def test_other_lengths_and_tolerances_need_no_compilation(sphere):

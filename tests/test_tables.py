@@ -124,7 +124,12 @@ def test_a_stencil_is_the_weighted_sum_of_differences_over_its_rows(rows):
     both = ComposedStencil((centred, stencil), (stencil, stencil))
     np.testing.assert_allclose(both.matrix().todense(), expected @ dense + dense @ dense, atol=1e-10)
     np.testing.assert_allclose(both(jnp.asarray(u)), both.matrix() @ u, atol=1e-10)
+    np.testing.assert_allclose(both.transpose(jnp.asarray(u)), both.matrix().T @ u, atol=1e-10)
     assert np.abs(np.linalg.eigvals(both.matrix().todense())).max() <= float(both.spectral_bound()) + 1e-9
+    with pytest.raises(ValueError, match="Expected a mean of 'arithmetic' or 'harmonic', found 'geometric'"):
+        stencil.with_conductivity(jnp.asarray(centre), "geometric")
+    with pytest.raises(ValueError, match="a stencil of differences only"):
+        centred.with_conductivity(jnp.asarray(centre), "harmonic")
 
 
 def test_small_tail_blocks_are_joined_and_large_ones_are_not():

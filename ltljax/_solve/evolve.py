@@ -267,7 +267,7 @@ def _choose(
     if isinstance(chosen, ImplicitRungeKutta | SBDF2):
         inverse = preconditioner_for(equation, surface, u0, t0) if preconditioner is None else preconditioner
         rtol, atol = _as_array(settings.rtol, surface), _as_array(settings.atol, surface)
-        chosen = dataclasses.replace(chosen, stages=StageSettings(inverse, rtol, atol))  # type: ignore
+        chosen = dataclasses.replace(chosen, stages=StageSettings(inverse, rtol, atol))  # type: ignore (a dataclass)
         uses_jacobi = isinstance(inverse, Jacobi)
         reason += f", stages preconditioned by {'Jacobi' if uses_jacobi else 'multigrid'}"
         return _Method(chosen, f"{name}: {reason}", uses_jacobi=uses_jacobi)

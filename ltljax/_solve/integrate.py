@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array
 
 from .._equations import Equation
-from .._lifting.schemes import Monotone
 from .._surface import Surface
 from .._tables import AnyArray
 from . import taped
@@ -278,7 +277,7 @@ def _largest(surface: Surface, u0: Array, rate: Callable[[Array, Array], Array],
     """The magnitude beyond which a state of the run has overflowed."""
     # Beyond this size the rate, which is larger than the state by up to the stiffness, could overflow.
     largest = jnp.asarray(_OVERFLOW * jnp.finfo(u0.dtype).max, u0.dtype)
-    if isinstance(surface.scheme, Monotone):
+    if surface.scheme.is_monotone:
         return largest
     # Growing modes would approach that limit in ever shorter steps. So the run also ends when the state exceeds
     # `_GROWTH` times the larger of its initial size and the change that the rate at u0 would cause over the whole run.

@@ -230,7 +230,7 @@ def stationary_diffusion(
     beta = diffusivities.reshape(-1)
     inverse = preconditioner.shifted(jnp.broadcast_to(jnp.mean(screening), beta.shape), beta)
     # At high order the operator may be far from the one that is preconditioned.
-    persists = not isinstance(surface.scheme, Monotone)
+    persists = not surface.scheme.is_monotone
     solution = linear_solve(
         apply, jnp.where(is_held, 0, value), inverse, rtol, preconditioner.max_iterations, persists=persists
     )

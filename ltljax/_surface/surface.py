@@ -18,7 +18,7 @@ from .._base.records import read_record, write_record
 from .._lifting.schemes import Monotone, Scheme
 from .._lifting.weighing import Geometry, Topology, weigh
 from .._mesh import Mesh, far_middle
-from .._tables import AnyArray, ComposedStencil, Stencil, difference_matrix, slot_sum
+from .._tables import AnyArray, ComposedStencil, Stencil, slot_sum
 from .building import SurfaceReport, as_text, build, float_dtype
 from .conservation import stationary_measure
 
@@ -225,8 +225,7 @@ class Surface(eqx.Module):
             ValueError: the scheme is not `Monotone`, or the surface is being traced: compute the mass outside of jit
                 and pass it as an argument.
         """
-        weights, diffusion = self.geometry.laplacian_weights, self.topology.diffusion
-        if not self.scheme.is_monotone or weights is None or diffusion is None:
+        if not self.scheme.is_monotone:
             raise ValueError(
                 f"{self.scheme} has no conserved measure, since its weights have both signs. Use Monotone()."
             )
@@ -237,10 +236,11 @@ class Surface(eqx.Module):
             )
         # Inside jit, a surface that is not traced is still computed with at once.
         with jax.ensure_compile_time_eval():
-            return self.remembered("mass", lambda: self._stationary_measure(difference_matrix(diffusion, weights)))
+            return self.remembered("mass", self._stationary_measure)
 
-    def _stationary_measure(self, generator) -> Float[Array, " V"]:
-        return jnp.asarray(stationary_measure(generator, np.asarray(self.vertex_areas)), self.dtype)
+    def _stationary_measure(self) -> Float[Array, " V"]:
+        generator, areas = self.laplacian_stencil.matrix(), np.asarray(self.vertex_areas)
+        return jnp.asarray(stationary_measure(generator, areas), self.dtype)
 
     @property
     def quadrature(self) -> Float[Array, " V"]:

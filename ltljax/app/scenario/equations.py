@@ -16,7 +16,6 @@ import numpy as np
 
 from ..._base.deprecated import warn_deprecated
 from ..._equations import CahnHilliard, Diffusion, Dirichlet, Equation, Neumann, ReactionDiffusion, Robin, kinetics
-from ..._lifting.schemes import Monotone
 from ..._mesh import Mesh
 from ..._operators import curvature, direction_tensor, elliptic_stencil, integrate
 from ..._solve import solve
@@ -200,7 +199,7 @@ def _heat(table: Table, fields: Fields) -> _Reaction:
         if is_balanced and not conditions:
             # Diffusion conserves the mean in this measure. In any other measure, a small mean would remain and
             # accumulate.
-            measure = surface.mass if isinstance(surface.scheme, Monotone) else surface.vertex_areas
+            measure = surface.quadrature
             g = g - integrate(surface, g, measure) / jnp.sum(measure)
         return Diffusion(tuple(diffusions), g[:, None], conditions)
 
