@@ -94,7 +94,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
-def test_a_stencil_is_the_weighted_sum_of_differences_over_its_rows(rows):
+def test_a_stencil_is_the_weighted_sum_of_differences_over_its_rows(rows, as_users_call_it):
     random = np.random.default_rng(0)
     offsets = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
     table = build_table(offsets, np.array([j for row in rows for j in row], np.int32))
